@@ -136,6 +136,22 @@ def test_the_pipeline_of_the_front_door_opens_what_the_front_door_opens():
         next(iter(front("fast")("sim:no_such")))
 
 
+@pytest.mark.parametrize(("rate_hz", "last_s"), [(4.0, 1.25), (None, 0.5)])
+def test_a_folder_of_pictures_has_the_given_rate_or_a_note_and_the_rate_comes_before_a_clock_offset(
+    tmp_path, rate_hz, last_s
+):
+    for number in range(1, 7):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((480, 640), np.uint8))
+    log = Telemetry(np.array([-9.0, -8.0]), np.full(2, 50.0), np.zeros(2), np.zeros((2, 2)), False)
+    pipeline = Pipeline(rate_hz=rate_hz, telemetry=log, camera=CAMERA, detector=lambda _: Detections())
+    *_, last = pipeline(tmp_path)
+    assert last.frame is not None and last.locations is not None
+    assert last.frame.time_s == pytest.approx(last_s)
+    assert any("10 frames a second are assumed" in note for note in pipeline.notes) == (rate_hz is None)
+    warned = last.locations.fix.cause.split("the telemetry has no data")[0]
+    assert ("first give --rate (rate_hz)" in warned) == (rate_hz is None)
+
+
 def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))

@@ -323,6 +323,7 @@ def test_a_log_is_asked_for_one_time():
 def test_detections_may_be_lists():
     found = Detections([[40, 60, 20, 20]], [0.9], label=["car"])  # type: ignore[arg-type]
     assert found.xyxy.tolist() == [[40, 60, 60, 80]] and found.label.dtype == object and found.class_id.tolist() == [-1]
+    assert Detections(CORNERS).score.tolist() == [1.0, 1.0]
     assert Detections([], []).xyxy.shape == (0, 4)  # type: ignore[arg-type]
 
 
@@ -334,5 +335,6 @@ def test_detections_may_be_tensors():
 
 @pytest.mark.parametrize("wrong", [{"box_px": [1, 2, 3]}, {"class_id": [np.nan]}, {"label": "car"}, {"score": 0.9}])
 def test_what_is_no_column_of_detections_is_one_line(wrong):
-    with pytest.raises(InputError, match=f"{next(iter(wrong))} of Detections"):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))} of Detections") as error:
         Detections(**{"box_px": [[40, 60, 20, 20]], "score": [0.9], **wrong})
+    assert np.ndim(*wrong.values()) or "give a list, such as [" in str(error.value)

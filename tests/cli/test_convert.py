@@ -35,7 +35,7 @@ def test_positions_become_a_geopackage(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("out", "said"), [("a.doc", "the ending of a.doc"), ("labels", "--clip"), ("a.gpkg", "places")]
+    ("out", "said"), [("a.doc", "the ending of a.doc"), ("labels", "--clip"), ("a.gpkg", "positions.csv")]
 )
 def test_what_cannot_be_written_is_one_line(out, said, tmp_path):
     (tmp_path / "in.csv").write_text(BOXES)

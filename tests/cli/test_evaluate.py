@@ -2,6 +2,8 @@
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.cli.conftest import bad, record
@@ -173,9 +175,43 @@ def test_a_mistake_is_one_line_and_exit_2(study, words, message) -> None:
     assert message in bad(study("--quiet", *words))
 
 
-@pytest.mark.parametrize("name", ["tracks.csv", "tracks.json"])
-def test_results_in_another_format_are_refused_with_the_command_that_converts_them(dddas, tmp_path, name):
-    (tmp_path / "gt.txt").write_text("1,1,10,10,20,20,1,-1,-1,-1\n")
-    (tmp_path / name).write_text("frame,identity,x_px,y_px,width_px,height_px\n1,1,10,10,20,20\n")
-    said = bad(dddas("evaluate", tmp_path / "gt.txt", tmp_path / name))
-    assert f"dddas convert {name} tracks.txt" in said
+@pytest.mark.parametrize("out", ["b.csv", "b.json", "b.xml", "b.parquet", "davis"])
+def test_results_in_each_format_that_convert_writes_score_as_text_does(dddas, file, tmp_path, out):
+    if out == "b.parquet":
+        pytest.importorskip("pyarrow", reason="the extra 'parquet' is not installed")
+    truth, text = file("gt.txt", TRUTH), file("b.txt", FOUND)
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "1.png"), np.zeros((40, 200), np.uint8))
+    more = ("--to", "davis", "--clip", tmp_path / "frames") if out == "davis" else ()
+    out = tmp_path / "as" / out
+    out.parent.mkdir()
+    assert dddas("convert", text, out, *more).exit_code == 0
+    out, folders = out / "masks" if more else out, (tmp_path / "by_text", tmp_path / "by_other")
+    for place, folder in zip((text, out), folders, strict=True):
+        done = dddas("evaluate", truth, place, "--out", folder)
+        assert done.exit_code == 0, done.output
+    one, other = (next(iter(measures(folder)["clips"].values())) for folder in folders)
+    assert other == one and one["tracks"]["n_tp"] == 2
+
+
+def test_the_csv_of_a_run_is_scored_without_its_detections_that_have_no_identity(dddas, file, tmp_path):
+    rows = "1,7,0,0,10,20,detection\n1,8,100,0,10,20,detection\n2,8,0,0,10,20,bridge\n2,,9,9,10,20,untracked\n"
+    table = file("tracks.csv", f"frame,identity,x_px,y_px,width_px,height_px,kind\n{rows}")
+    assert dddas("evaluate", file("gt.txt", TRUTH), table).exit_code == 0
+    assert measures(tmp_path)["clips"]["tracks"]["tracks"]["n_fp"] == 1
+
+
+def test_a_film_names_its_true_boxes_and_small_boxes_name_the_option_for_them(dddas, file, tmp_path):
+    (tmp_path / "film" / "truth").mkdir(parents=True)
+    (tmp_path / "found").mkdir()
+    truth = file("film/truth/gt.txt", "".join(f"{n},1,{n},0,6,6,1,-1,-1\n" for n in range(1, 9)))
+    found = file("found/tracks.txt", "".join(f"{n},1,{n + 2},1,6,6,1,-1,-1,-1\n" for n in range(1, 9)))
+    assert f"{truth} holds the true boxes" in bad(dddas("evaluate", truth.parent.parent, found))
+    said = dddas("evaluate", truth, found).stdout
+    assert "8 more of 8 are met from IoU 0.2 on than from 0.5; --iou 0.2 counts" in said.replace("\n", " ")
+    assert measures(found.parent)["clips"]["tracks"]["tracks"]["recall"] == 0
+    done = dddas("evaluate", truth, found, "--iou", 0.2)
+    assert "note: boxes count as found from IoU 0.2 on" in done.stdout
+    scored = measures(found.parent)["clips"]["tracks"]["tracks"]
+    assert scored["recall"] == scored["idf1"] == 1
+    assert "must be above 0 and at most 1, got 2" in bad(dddas("evaluate", truth, found, "--iou", 2))

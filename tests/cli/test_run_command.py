@@ -290,7 +290,6 @@ def test_a_network_gives_classes_to_places_and_zones_and_what_moves_is_kept(ddda
         (["--movers"], "--movers is for --detector or --detections"),
         (["--detector", "a.onnx", "--detections", "{boxes}"], "were both given"),
         (["--detector", "none.onnx"], "none.onnx is no file"),
-        (["--detector", "a.onnx", "--live"], "--detector is of no use with --live"),
         (["--detections", "none.csv"], "none.csv cannot be read"),
     ],
 )

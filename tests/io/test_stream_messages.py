@@ -65,7 +65,11 @@ def test_the_page_names_every_field_and_no_other():
     rows = [row for row in PAGE.splitlines() if row.startswith("| `")]
     named = {name for row in rows for name in re.findall(r"`([a-z][a-z0-9_.\[\]]*)`", row.split("|")[1])}
     sent = set()
-    for fields in map(strict, [*json_lines(ABOUT, located(), tracked(), most_bytes=512), example()]):
+    frame = located()
+    tracks = replace(frame.tracked.tracks, label=np.array(["car"] * len(frame.tracked.tracks), object))
+    named_frame = replace(frame, tracked=replace(frame.tracked, tracks=tracks))
+    lines = [*json_lines(ABOUT, frame, tracked(), most_bytes=512), *json_lines(ABOUT, named_frame, None), example()]
+    for fields in map(strict, lines):
         sent |= set(fields) | {f"targets[].{name}" for row in fields["targets"] for name in row}
         sent |= {f"{part}.{name}" for part in ("ground", "appearance") for name in fields.get(part) or {}}
     assert {name for name in sent if not name.startswith(("ground.landmarks", "adjustments"))} <= named

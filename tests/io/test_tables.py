@@ -129,8 +129,8 @@ def test_detections_of_a_scene_as_motchallenge_text_and_csv(tmp_path, scene):
     assert mot == "7,-1,0.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n7,-1,3.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n"
     header, first, second = (tmp_path / "detections.csv").read_text().splitlines()
     assert header.startswith("frame,target,x_px,y_px,width_px,height_px,score,kind,area_px,heading_deg,speed_px")
-    assert first == "7,1,0.00,0.00,2.00,2.00,0.8750,moving,4,0.0,1.500"
-    assert second == "7,2,3.00,0.00,2.00,2.00,0.8750,moving,4,,"
+    assert first == "7,1,0.00,0.00,2.00,2.00,0.8750,moving,4,0.0,1.500,,"
+    assert second == "7,2,3.00,0.00,2.00,2.00,0.8750,moving,4,,,,"
 
 
 def test_a_clip_without_targets_gives_empty_tables_and_a_discard_leaves_none(tmp_path, scene):

@@ -55,8 +55,8 @@ def evaluate(
     result: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Output of dddas detect or track, MOTChallenge text, or a folder of these by clip name. Results of "
-            "several methods are compared with the first."
+            help="Output of dddas detect or track, a file that dddas convert reads, or a folder of these by clip name. "
+            "Results of several methods are compared with the first."
         ),
     ] = None,
     names: Annotated[
@@ -98,6 +98,10 @@ def evaluate(
             "or removed together with the tracks' boxes that match them. [default: dropped]"
         ),
     ] = None,
+    iou: Annotated[
+        float | None,
+        typer.Option(help="The overlap from which a box counts as found; lower it for tiny targets. [default: 0.5]"),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -125,7 +129,7 @@ def evaluate(
             )
         check_interval(interval)
         how: dict[str, Any] = {"first_frame": first_frame, "interval": interval or 1}
-        how["ignoring"] = (ignored or Ignored.dropped).value
+        how |= {"ignoring": (ignored or Ignored.dropped).value, "least": 0.5 if iou is None else iou}
         if len(result) > 1 or names is not None:
             _evaluate_methods(out or Path("dddas-study"), truth, result, _split(names), how, quiet)
             return
@@ -143,7 +147,7 @@ def evaluate(
     kinds = _split(keep)
     check_kinds(kinds)
     refuse_options(
-        {"TRUTH": truth, "--names": names, "--first-frame": first_frame, "--ignored": ignored},
+        {"TRUTH": truth, "--names": names, "--first-frame": first_frame, "--ignored": ignored, "--iou": iou},
         "is of no use with --dataset",
     )
     check_jobs(jobs, scheduler)
@@ -185,13 +189,14 @@ def score(
     first_frame: int | None = None,
     interval: int = 1,
     ignoring: Literal["dropped", "removed"] = "dropped",
+    least: float = 0.5,
 ) -> dict[str, Any]:
     """Score a result, and write metrics.json into a folder. Raise InputError for bad input."""
     from torchvision_dddas.io.atomic_files import save_file
     from torchvision_dddas.io.output import finite
     from torchvision_dddas.lab.evaluation.evaluate import evaluate
 
-    report = evaluate(truth, result, first_frame, interval, ignoring)
+    report = evaluate(truth, result, first_frame, interval, ignoring, least)
     save_file(out / "metrics.json", (json.dumps(finite(report), indent=2) + "\n").encode())
     return report
 

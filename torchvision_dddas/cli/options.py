@@ -14,6 +14,7 @@ from torchvision_dddas.errors import InputError, printable
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
+    from torchvision_dddas.detection import OnnxDetector
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -56,6 +57,21 @@ Ignore = Annotated[
 BoxFormat = Annotated[
     BoxOrder | None,
     typer.Option(help="Columns of a box: left, top, size; corners; centre, size. [default: by the table]"),
+]
+Detector = Annotated[
+    Path | None,
+    typer.Option(metavar="MODEL", help="An ONNX file of a YOLO or DETR: its boxes and classes in place of movers."),
+]
+Provider = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Execution provider of --detector: cpu, cuda, openvino, ... [default: cpu]"),
+]
+LeastScore = Annotated[float | None, typer.Option(help="Lowest score of --detector's boxes. [default: 0.25]")]
+ClassFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="A line for each class of --detector. [default: as in MODEL]")
+]
+Movers = Annotated[
+    bool, typer.Option("--movers", help="Also detect motion beside --detector or --detections; boxes get speeds.")
 ]
 Poses = Annotated[
     list[Path] | None,
@@ -167,6 +183,27 @@ def note_patrol(config: str | None, quiet: bool) -> None:
     if "patrol" in names and not quiet:
         words = "with telemetry, which determines the size of people, patrol equals the default"
         echo(f"dddas: --config patrol assumes people of about 4 px (gates.person_px); {words}", err=True)
+
+
+def open_detector(
+    detector: Path | None, provider: str | None, score: float | None, classes: Path | None
+) -> "OnnxDetector | None":
+    """Return the network of --detector, None without one. Raise InputError for its other options alone."""
+    if detector is None:
+        of_detector = {"--provider": provider, "--score": score, "--classes": classes}
+        refuse_options(of_detector, "is for --detector MODEL; give it too")
+        return None
+    from torchvision_dddas.detection import OnnxDetector
+
+    return OnnxDetector(detector, provider=provider or "cpu", score=0.25 if score is None else score, classes=classes)
+
+
+def check_movers(network: "OnnxDetector | None", movers: bool, of_movers: Mapping[str, object]) -> None:
+    """Raise InputError for --movers without --detector, and for options `of_movers` that have no effect."""
+    if network is None:
+        refuse_options({"--movers": movers or None}, "is for --detector; the command finds what moves by itself")
+    elif not movers:
+        refuse_options(of_movers, "is for the search for what moves; give --movers too, or leave it out")
 
 
 def load_settings(

@@ -16,16 +16,22 @@ from torchvision_dddas.cli.options import (
     REPORTS,
     Backend,
     BoxFormat,
+    ClassFile,
     Config,
+    Detector,
     EngineOption,
     Ignore,
+    LeastScore,
+    Movers,
     Out,
     Overrides,
+    Provider,
     Quiet,
     Rate,
     check_interval,
     load_settings,
     note_patrol,
+    open_detector,
     print_lines,
     refuse_options,
     report_errors,
@@ -81,20 +87,11 @@ def run(
         typer.Option(metavar="FILE", help="Boxes and classes of your own detector. [default: find what moves]"),
     ] = None,
     box_format: BoxFormat = None,
-    detector: Annotated[
-        Path | None,
-        typer.Option(metavar="MODEL", help="An ONNX file of a YOLO or DETR: its boxes and classes in place of movers."),
-    ] = None,
-    provider: Annotated[
-        str | None, typer.Option(metavar="NAME", help="What runs --detector: cpu, cuda, openvino, ... [default: cpu]")
-    ] = None,
-    score: Annotated[float | None, typer.Option(help="Lowest score of --detector's boxes. [default: 0.25]")] = None,
-    classes: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A line for each class of --detector. [default: as in MODEL]")
-    ] = None,
-    movers: Annotated[
-        bool, typer.Option("--movers", help="Find what moves beside --detector or --detections: boxes get speeds.")
-    ] = False,
+    detector: Detector = None,
+    provider: Provider = None,
+    score: LeastScore = None,
+    classes: ClassFile = None,
+    movers: Movers = False,
     zones: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="GeoJSON or KML of areas and lines: who enters, leaves, dwells, crosses."),
@@ -165,7 +162,7 @@ def run(
     given_boxes = {"--detections": detections, "--detector": detector, "--movers": movers or None}
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
-        others |= given_boxes
+        others["--detections"] = detections
         refuse_options(others, "is of no use with --live, which draws and steers nothing")
     else:
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
@@ -194,9 +191,7 @@ def run(
         raise InputError("--detections and --detector were both given; give one of them")
     elif not movers:
         refuse_options({"--ignore": ignore}, "is for the search for movers; give --movers too, or leave it out")
-    if detector is None:
-        of_detector = {"--provider": provider, "--score": score, "--classes": classes}
-        refuse_options(of_detector, "is for --detector MODEL; give it too")
+    network = open_detector(detector, provider, score, classes)
     if detections is None and box_format is not None:
         raise InputError("--box-format is for --detections FILE; give it too")
     given = None
@@ -223,10 +218,11 @@ def run(
             placed,
             ground or (),
             aerial or (),
+            network,
+            movers,
         )
         raise typer.Exit(Ended(code))  # the last line on the screen says where the results are
     from torchvision_dddas import open_video
-    from torchvision_dddas.detection import OnnxDetector
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.joined_clips import JoinedSource
@@ -235,11 +231,6 @@ def run(
 
     names = parse_save(save, PipelineRecorder.saved)
     beside_clip = [path for path in (zones, detections, detector, classes) if path is not None]
-    network = None
-    if detector is not None:
-        network = OnnxDetector(
-            detector, provider=provider or "cpu", score=0.25 if score is None else score, classes=classes
-        )
     team = None
     if ground or aerial:
         from torchvision_dddas.control import GroundTeam

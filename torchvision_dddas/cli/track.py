@@ -10,16 +10,23 @@ from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
     BoxFormat,
+    ClassFile,
     Config,
+    Detector,
     EngineOption,
     Ignore,
+    LeastScore,
+    Movers,
     Out,
     Overrides,
+    Provider,
     Quiet,
     Rate,
     Telemetry,
     check_interval,
+    check_movers,
     load_settings,
+    open_detector,
     print_lines,
     report_errors,
 )
@@ -28,7 +35,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.detection import Engine
+    from torchvision_dddas.detection import Engine, OnnxDetector
     from torchvision_dddas.types import DetectionTable, Source, TrackedFrame
     from torchvision_dddas.types import Telemetry as Flown
 
@@ -52,9 +59,14 @@ def track(
     telemetry: Telemetry = None,
     rate: Rate = None,
     ignore: Ignore = None,
+    detector: Detector = None,
+    provider: Provider = None,
+    score: LeastScore = None,
+    classes: ClassFile = None,
+    movers: Movers = False,
     quiet: Quiet = False,
 ) -> None:
-    """Give lasting identities to targets detected in a clip, or to targets of a table, with or without its clip.
+    """Give lasting identities to targets found in a clip, or to targets of a table, with or without its clip.
 
     Writes tracks.txt (MOTChallenge), tracks.csv and run.json under --out. With a clip, also writes overlay.mp4 and
     appearance.csv (why the association used appearance, or not). --backend chooses the engine of detection and
@@ -78,7 +90,11 @@ def track(
     if clip is None and save and names:
         raise InputError("--save overlay needs a clip to draw on; give INPUT, or leave --save out")
     names = () if clip is None else names
-    inputs = [Path(name) for name in (clip, detections, telemetry) if name is not None]
+    network = open_detector(detector, provider, score, classes)
+    if network is not None and (clip is None or detections is not None):
+        raise InputError("--detector looks at the pictures of a clip; give INPUT, and leave --detections out")
+    check_movers(network, movers, {"--telemetry": telemetry, "--ignore": ignore})
+    inputs = [Path(name) for name in (clip, detections, telemetry, detector, classes) if name is not None]
     refuse_own_input(inputs, [out / name for name in TrackRecorder.files], "folder with --out")
     with TrackRecorder(out, names) as output:
         source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given) if clip is not None else None
@@ -87,7 +103,7 @@ def track(
         flight = None
         if source is not None and clip is not None:
             settings, flight, more = prepare_detection(telemetry, settings, source, clip)
-            notes += more
+            notes += [*more, *(network.notes if network is not None else ())]
         engine = load_engine(backend.value, settings) if source is not None else None
         facts = {
             "input": clip,
@@ -99,22 +115,25 @@ def track(
             else {"given": len(table), "used": int(is_sampled(table.frame, interval).sum())},
             "interval_frames": interval,
             "backend": engine and engine.name,
+            **({"detector": network.facts, "movers": movers} if network is not None else {}),
             "settings": settings.model_dump(),
         }
         rate_hz, size = (source.rate_hz, source.size) if source is not None else (10.0, (1, 1))
         record = output.begin(facts, rate_hz / interval, size)
         record.notes += notes
+        if network is not None and not movers:
+            record.scale = None  # it is that of the search for what moves
         last = source.count if source is not None else table.last if table is not None else None
         record_results(
             output,
             record,
-            _track(table, source, engine, settings, interval, backend.value, flight, record.notes),
+            _track(table, source, engine, settings, interval, backend.value, flight, record.notes, network, movers),
             source.name if source is not None else str(detections),
             None if last is None else -(-last // interval),
             quiet,
             source,
         )
-        if source is not None:
+        if source is not None and (network is None or movers):
             record.notes += clip_notes(source, interval, settings)
         if source is not None and table is not None and table.last > source.last:
             record.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
@@ -135,9 +154,11 @@ def _track(
     backend: str,
     flight: "Flown | None",
     notes: list[str],
+    network: "OnnxDetector | None",
+    movers: bool,
 ) -> "Iterator[TrackedFrame]":
     from torchvision_dddas.detection import detect_motion
-    from torchvision_dddas.pipeline import note_uncovered
+    from torchvision_dddas.pipeline import Assembly, Pipeline, note_uncovered
     from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 
     if source is None or engine is None:
@@ -145,5 +166,9 @@ def _track(
         return track_table(table, settings, interval)
     if table is not None:
         return track_clip(source, table, engine, settings, interval, backend)
+    if network is not None:
+        ready = Assembly(settings, engine, flight)
+        results = Pipeline.from_assembly(ready, interval=interval, detector=network, movers=movers)(source)
+        return (result.tracked for result in results)
     scenes = note_uncovered(detect_motion(source, settings, engine, flight), flight, notes)
     return track_scenes(scenes, settings, interval, source.size, backend=backend, rate_hz=source.rate_hz)

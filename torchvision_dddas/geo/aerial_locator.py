@@ -142,6 +142,7 @@ class AerialLocator:
             )
         self.camera, self.settings, self.rate_hz, self.focal_known = camera, settings, rate_hz, focal_known
         self.notes: list[str] = []
+        self.assumes_rate = False
         self.set_site(site)
         self._solver = solver
         self._georeferencer = Georeferencer(camera, settings, solver, focal_known, site.landmarks.names)
@@ -150,7 +151,9 @@ class AerialLocator:
 
     def restarted(self) -> "AerialLocator":
         """Return this locator in its state before the first frame."""
-        return self.from_site(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
+        again = self.from_site(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
+        again.assumes_rate = self.assumes_rate
+        return again
 
     def set_site(self, site: Site) -> None:
         """Replace the site by one with the latest reports of landmarks and vehicle, in the same local metres."""
@@ -223,6 +226,11 @@ class AerialLocator:
             fixed = self.fix_frame(frame, self.landmarks_at(frame), time_s=(times_s or {}).get(frame))
             yield self.locate_targets(fixed, targets)
 
+    @property
+    def rate_warning(self) -> str:
+        """The beginning of a message about the times of pictures; empty if their rate is known."""
+        return "the frame rate is assumed, so first give --rate (rate_hz); " if self.assumes_rate else ""
+
     def time_s(self, frame: int) -> float:
         """Return the time of a frame since the clip's first, at the constant rate."""
         return (frame - 1) / self.rate_hz
@@ -275,7 +283,10 @@ class AerialLocator:
         if self.settings.aerial.mode == "paper" and self.site.origin_deg is not None:
             degrees = geometry.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
         when = self.time_s(frame) if time_s is None else time_s
-        fix = self._georeferencer.update(frame, when, self.telemetry_at(when), used, degrees)
+        flight = self.telemetry_at(when)
+        fix = self._georeferencer.update(frame, when, flight, used, degrees)
+        if flight is None and fix.cause:
+            fix = replace(fix, cause=f"{self.rate_warning}{fix.cause}")
         seconds = {"fix": time.perf_counter() - start}
         return FrameFix(replace(fix, time_s=when), used, adjustments, seconds, when)
 

@@ -47,8 +47,8 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
     offset_s, sigma_s = found[0], max(found[1], 0.001)
     when = f"{abs(offset_s):.3f} s {'later' if offset_s > 0 else 'earlier'} in the pictures than in the log"
     return (
-        f"log and clip are not synchronised: the camera turns {when} (sigma {sigma_s:.3f} s); set "
-        f"aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
+        f"{locator.rate_warning}log and clip are not synchronised: the camera turns {when} (sigma {sigma_s:.3f} s); "
+        f"set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
     )
 
 

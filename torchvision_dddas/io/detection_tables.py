@@ -209,7 +209,7 @@ def _in_pixels(
     if shares and size is None:
         raise InputError(
             f"detections {path}: boxes in [0, 1] are shares of a picture ({' or '.join(shares)}), whose "
-            "size is not known: give the clip too, or boxes in pixels"
+            "size is not known: give the clip too (`dddas convert --clip CLIP` takes it), or boxes in pixels"
         )
     if order is None and is_folder:
         found = "yolo"
@@ -290,6 +290,14 @@ def read_header(path: str | Path) -> list[str]:
     """Return the column names of a table: MOT_NAMES if its first line holds numbers, [] if the table is empty."""
     text, is_named = _read_cells(path)
     return text.header if text.rows or is_named else []
+
+
+def is_mot_text(path: Path) -> bool:
+    """Whether a file is text without names of columns that no other format explains. Raises InputError."""
+    if path.is_dir() or path.suffix.lower() in (".json", ".xml", ".parquet"):
+        return False
+    text, is_named = _read_cells(path, "result")
+    return not is_named and name_columns(path, text) is None
 
 
 def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:

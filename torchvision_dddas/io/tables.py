@@ -454,10 +454,11 @@ An identity of -1 means no identity.
 MOT_TRACKS = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, *MOT.columns[-3:], has_header=False)
 """The same columns with unrounded scores."""
 
-DETECTIONS = Schema("detections", FRAME, TARGET, *BOX, SCORE, KIND, Column("area_px", ".0f"), *MOTION)
+CLASS_COLUMNS = (Column("class"), Column("class_id", ".0f"))
+DETECTIONS = Schema("detections", FRAME, TARGET, *BOX, SCORE, KIND, Column("area_px", ".0f"), *MOTION, *CLASS_COLUMNS)
 """detections.csv of `dddas detect`. heading_deg: clockwise from the picture's upward direction.
 
-heading_deg and speed_px_per_frame are relative to the background.
+heading_deg and speed_px_per_frame are relative to the background. class, class_id: empty if unknown.
 """
 
 
@@ -465,6 +466,11 @@ def mot_rows(frame: int, box_px: np.ndarray, score: np.ndarray, identity: np.nda
     """Return the columns of MOT and MOT_TRACKS for the boxes (N, 4) of a frame."""
     box = dict(zip(("x_px", "y_px", "width_px", "height_px"), np.reshape(box_px, (-1, 4)).T, strict=True))
     return {"frame": frame, "identity": identity, **box, "score": score, "x": -1, "y": -1, "z": -1}
+
+
+def class_rows(label: np.ndarray, class_id: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of CLASS_COLUMNS."""
+    return {"class": label, "class_id": np.where(class_id < 0, np.nan, class_id)}
 
 
 def compass_deg(heading_rad: float) -> float:
@@ -487,6 +493,7 @@ def detection_tables(folder: Path) -> TableFiles[Scene]:
             "area_px": found.area_px,
             "heading_deg": [compass_deg(heading) for heading in found.heading_rad.tolist()],
             "speed_px_per_frame": found.speed_px,
+            **class_rows(found.label, found.class_id),
         }
 
     return TableFiles({folder / "detections.txt": (MOT, mot), folder / "detections.csv": (DETECTIONS, named)})

@@ -17,19 +17,20 @@ from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.maps.formats import xml_text
 from torchvision_dddas.io.tables import (
     BOX,
+    CLASS_COLUMNS,
     FRAME,
     IDENTITY,
     MOT_TRACKS,
     PRECISE_SCORE,
-    Column,
     Schema,
+    class_rows,
     mot_rows,
     parse_numbers,
     read_csv,
 )
 from torchvision_dddas.types import AerialLocations, DetectionTable, FrameResult, Positions, Scene, TrackedFrame, Tracks
 
-_CSV = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, Column("class"), Column("class_id", ".0f"))
+_CSV = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, *CLASS_COLUMNS)
 _MOST_VALUES = 65535  # the largest value of a 16-bit mask
 
 Item = FrameResult | TrackedFrame | Tracks | Scene | AerialLocations
@@ -148,7 +149,7 @@ def _part_of(item: object) -> Tracks | Positions:
 
 
 def _write_csv(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    rows = {**_mot_rows(table), "class": table.label, "class_id": np.where(table.class_id < 0, np.nan, table.class_id)}
+    rows = {**_mot_rows(table), **class_rows(table.label, table.class_id)}
     rows["identity"] = [number if number > 0 else None for number in table.identity.tolist()]
     save_file(path, (_CSV.header + _CSV.format_rows(rows)).encode())
     return []
@@ -279,7 +280,7 @@ def _write_davis(table: Tracks, path: Path, size: Size, names: Sequence[str]) ->
 
 def _write_columns(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
     if path.suffix.lower() == ".gpkg":
-        raise InputError(f"{path} holds places, and these are boxes: give positions with longitude and latitude")
+        raise InputError(f"{path} holds places, and these are boxes: give the positions.csv of dddas run or locate")
     write_columns(table.to_columns(), path)
     return []
 

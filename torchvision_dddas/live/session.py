@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, is_set, with_parameters
-from torchvision_dddas.detection import check_length, load_engine
+from torchvision_dddas.detection import OnnxDetector, check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
 from torchvision_dddas.geo import Zones
 from torchvision_dddas.io.interrupts import Stopped, StopSignals
@@ -76,11 +76,14 @@ def run_live(
     zones: Zones | None = None,
     ground: Sequence[Path] = (),
     aerial: Sequence[Path] = (),
+    detector: OnnxDetector | None = None,
+    movers: bool = False,
 ) -> int:
     """Run until the pictures end or a signal ends the run, and return the exit code. Write a new folder under out.
 
     SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. wait: wait for an
-    absent camera at the start. Raise InputError for any other fault at the start; a later fault becomes an event.
+    absent camera at the start. detector, movers: as for `Pipeline`. Raise InputError for any other fault at the start;
+    a later fault becomes an event.
     """
     address = None if serve is None else parse_address(serve)
     if wait and stream_target(clip) is None:
@@ -131,6 +134,7 @@ def run_live(
         prepare = partial(assemble_files, given, telemetry, settings, source, backend, clip)
         ready = prepare()
         ready.notes.extend([str(source.levels)] if source.levels else [])
+        ready.notes.extend(detector.notes if detector is not None else ())
         flight, is_recording, offset_s = ready.telemetry, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
         if zones is not None:
@@ -142,7 +146,7 @@ def run_live(
         team = LiveTeam((ground, aerial), settings, backend, ready.watch, source, health) if ground or aerial else None
         # For a recording, times of day come from its own log, if the log has a clock.
         recorded_utc_s = flight.start_utc_s if is_recording and flight is not None else nan
-        begin = build_path(ready, source, people, interval, backend, health, prepare)
+        begin = build_path(ready, source, people, interval, backend, health, prepare, detector, movers)
         # Data that streams need; the time follows the source's clock.
         about = About(time.time())
         if site is not None:
@@ -163,6 +167,7 @@ def run_live(
         if given is not None and ready.watch is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
         facts |= {key: paths for key, paths in (("ground", ground), ("aerial", aerial)) if paths}
+        facts |= {} if detector is None else {"detector": detector.facts, "movers": movers}
         facts["settings"] = ready.settings.model_dump()
         log = SessionLog(folder, facts)
         stack.callback(log.close)
@@ -271,6 +276,8 @@ def build_path(
     backend: str,
     health: Health,
     prepare: Callable[[], Assembly],
+    detector: OnnxDetector | None = None,
+    movers: bool = False,
 ) -> Callable[[Feed], Iterator[Result]]:
     """Return the path from frames to results, which restarts at each call, and sheds load.
 
@@ -320,6 +327,8 @@ def build_path(
             seen=None if person_tracker is None else person_tracker.update,
             retune=retune,
             pictures=False,
+            detector=detector,
+            movers=movers,
         )
         for result in pipeline(feed):
             yield result, None if person_tracker is None else person_tracker.people_of(result.number, feed.ended)

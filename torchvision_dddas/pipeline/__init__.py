@@ -15,7 +15,7 @@ from torchvision_dddas.pipeline.assembly import (
     read_locator,
 )
 from torchvision_dddas.pipeline.further_uavs import open_uav, prepare_uav
-from torchvision_dddas.pipeline.pipeline import ClipSource, Pipeline
+from torchvision_dddas.pipeline.pipeline import ClipSource, Pipeline, find_scenes
 
 __all__ = [
     "AerialInput",
@@ -27,6 +27,7 @@ __all__ = [
     "assemble_files",
     "assemble_mission",
     "clip_notes",
+    "find_scenes",
     "locator_facts",
     "map_site",
     "note_uncovered",

@@ -144,9 +144,10 @@ def assemble_files(
     if given is not None and not (given.landmarks is None and reason):
         colours = read_colours(given.colours) if given.colours is not None else None
         frames = None if source.count is None else (1, source.count)
-        locator, notes = read_locator(
-            given, settings, source.size, source.rate_hz, backend, frames, "clip", of, colours
-        )
+        is_assumed = getattr(source, "assumes_rate", False)
+        what = f"clip, whose frame rate is assumed (give --rate), {source.rate_hz:g} Hz:" if is_assumed else "clip"
+        locator, notes = read_locator(given, settings, source.size, source.rate_hz, backend, frames, what, of, colours)
+        locator.assumes_rate = is_assumed
         landmarks = locator.site.landmarks
         if given.landmarks is not None:
             check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
@@ -221,10 +222,13 @@ def _read_telemetry(
 
 def _rate_notes(source: Source) -> list[str]:
     """Return a note if the number of pictures a second is unknown, as for a folder of pictures."""
-    if not getattr(source, "assumes_rate", False):
-        return []
-    assumed = f"no frame rate is known: {source.rate_hz:g} frames a second are assumed"
-    return [f"{assumed}, which affects speeds and the alignment with a log; set --rate before any clock offset"]
+    return [describe_assumed_rate(source.rate_hz)] if getattr(source, "assumes_rate", False) else []
+
+
+def describe_assumed_rate(rate_hz: float) -> str:
+    """Return the note on a clip whose number of pictures a second is unknown."""
+    assumed = f"no frame rate is known: {rate_hz:g} frames a second are assumed"
+    return f"{assumed}, which affects speeds and the alignment with a log; set --rate (rate_hz) before any clock offset"
 
 
 def note_uncovered(scenes: Iterable[Scene], telemetry: Telemetry | None, notes: list[str]) -> Iterator[Scene]:

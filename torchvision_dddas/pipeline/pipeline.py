@@ -32,7 +32,7 @@ from torchvision_dddas.geo import (
     tracked_targets,
 )
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.pipeline.assembly import Assembly, assemble
+from torchvision_dddas.pipeline.assembly import Assembly, assemble, describe_assumed_rate
 from torchvision_dddas.pipeline.moving_boxes import MovingBoxes
 from torchvision_dddas.pipeline.own_detector import Detector, OwnDetector
 from torchvision_dddas.tracking import CrowdEvents, CrowdIdentities, SceneTracker, without_picture
@@ -45,6 +45,7 @@ from torchvision_dddas.types import (
     FrameResult,
     Landmarks,
     Scene,
+    Source,
     Telemetry,
     TrackedFrame,
     ZoneEvent,
@@ -98,7 +99,7 @@ class Pipeline:
         ground: str | Path | Sequence[str | Path] = (),
         aerial: str | Path | Sequence[str | Path] = (),
         interval: int = 1,
-        rate_hz: float = 10.0,
+        rate_hz: float | None = None,
     ) -> None:
         """settings: a record, the name of a shipped configuration, or a TOML file. backend: auto, onboard or torch.
 
@@ -110,11 +111,11 @@ class Pipeline:
         without a class.
         ground, aerial: TOML files of ground platforms and further UAVs, as for `dddas run`; results then have
         `confirmed` and `fused`.
-        interval: frames from one tracked frame to the next. rate_hz: frames a second for frames that come one by one; a
-        source has its own rate.
+        interval: frames from one tracked frame to the next. rate_hz: frames a second of a path, and of frames that
+        come one by one; None: the video's own rate, or 10 for pictures, with a note. An opened source has its own rate.
         Raise InputError for values of a wrong type, and for colours, camera or elevation without anything to locate.
         """
-        if interval < 1 or not rate_hz > 0:
+        if interval < 1 or not (rate_hz is None or rate_hz > 0):
             raise InputError(f"interval must be at least 1 and rate_hz positive, got {interval} and {rate_hz}")
         if isinstance(settings, str | Path):
             settings = load_config(settings)
@@ -141,7 +142,7 @@ class Pipeline:
             "colours": colours,
             "elevation": elevation,
         }
-        self._backend, self.interval, self.rate_hz = backend, interval, rate_hz
+        self._backend, self.interval, self._given_hz, self.rate_hz = backend, interval, rate_hz, rate_hz or 10.0
         self.settings, self.telemetry = settings or Settings(), telemetry
         self.notes: list[str] = []
         if landmarks is None and not has_places(telemetry):
@@ -188,7 +189,7 @@ class Pipeline:
         Raise InputError for another source, for frames of a wrong shape or type, and for fewer than three frames.
         """
         if isinstance(source, str | Path):
-            source = self.open_clip(str(source), full_scale=self.settings.levels.given)
+            source = self.open_clip(str(source), rate_hz=self._given_hz, full_scale=self.settings.levels.given)
         if not hasattr(source, "__iter__"):
             raise InputError(f"a pipeline needs a path or frames, got {type(source).__name__}")
         self._detector = None
@@ -198,7 +199,8 @@ class Pipeline:
         """Process one frame, and return the results that it settles. Raise InputError if it is no picture."""
         if self._detector is None:
             image = as_picture(frame.image if isinstance(frame, Frame) else frame)
-            engine = self._begin((image.shape[1], image.shape[0]), self.rate_hz)
+            is_assumed = self._given_hz is None and not isinstance(frame, Frame)
+            engine = self._begin((image.shape[1], image.shape[0]), self.rate_hz, is_assumed)
             self._detector = self._own(engine) or MotionDetector(
                 self.settings, backend=engine, rate_hz=self.rate_hz, telemetry=self.telemetry
             )
@@ -218,7 +220,7 @@ class Pipeline:
                 yield from self.update(frame)
             yield from self.flush()
             return
-        engine = self._begin(source.size, source.rate_hz)
+        engine = self._begin(source.size, source.rate_hz, getattr(source, "assumes_rate", False))
         own = self._own(engine)
         scenes = detect_motion(source, self.settings, engine, self.telemetry, retune=self._retune)
         for scene in scenes if own is None else (scene for frame in source for scene in own.update(frame)):
@@ -232,12 +234,16 @@ class Pipeline:
             return None
         return OwnDetector(given, engine, interval=self.interval, rate_hz=self.rate_hz)
 
-    def _begin(self, size_px: tuple[int, int], rate_hz: float) -> Engine:
+    def _begin(self, size_px: tuple[int, int], rate_hz: float, is_assumed: bool) -> Engine:
         """Start a clip: make a tracker, and the parts that locate its frames."""
         assembly, given = self._assembly, self.settings
         if assembly is None:
             assembly = assemble(self.settings, self._backend, size_px, rate_hz, **self._given)
             self.notes = [*assembly.notes] if assembly.watch is not None else self.notes
+            if is_assumed and (note := describe_assumed_rate(rate_hz)) not in self.notes:
+                self.notes.append(note)
+            if assembly.watch is not None:
+                assembly.watch.locator.assumes_rate = is_assumed
         self.settings, self.telemetry = assembly.settings, assembly.telemetry
         self._watch, self._mission = assembly.watch, assembly.mission
         self._clip_rate_hz = rate_hz
@@ -322,6 +328,22 @@ class Pipeline:
                 if origin is None
                 else replace(event, lonlat_deg=geometry.lonlat(event.east_north_m[None], origin)[0])
             )
+
+
+def find_scenes(
+    source: Source,
+    settings: Settings,
+    engine: Engine,
+    telemetry: Telemetry | None = None,
+    detector: Detector | DetectionTable | None = None,
+    movers: bool = False,
+) -> Iterator[Scene]:
+    """Yield the scenes of a clip without identities. detector, movers: as for `Pipeline`."""
+    if detector is not None and not movers:
+        own = OwnDetector(detector, engine, rate_hz=source.rate_hz)
+        return (scene for frame in source for scene in own.update(frame))
+    scenes = detect_motion(source, settings, engine, telemetry)
+    return scenes if detector is None else map(MovingBoxes(detector).combine, scenes)
 
 
 def _repeated(watched: WatchedScene, scene: Scene) -> WatchedScene:

@@ -15,7 +15,7 @@ from torchvision_dddas.types.table import Boxes, Table, complete_table
 class Detections(Boxes):
     """The targets detected in one frame, one row per target; row i has value i + 1 in the frame's mask.
 
-    box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
+    box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1], 1 where none is given.
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
     middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. class_id: (N,)
@@ -44,9 +44,8 @@ class Detections(Boxes):
         for name, values in vars(self).copy().items():
             if name != "kind" and not isinstance(values, np.ndarray):
                 object.__setattr__(self, name, _as_column(name, values))
-        nan = np.nan
-        unknown = {"area_px": nan, "heading_rad": nan, "speed_px": nan, "middle_px": nan, "label": "", "class_id": -1}
-        complete_table(self, len(self.box_px), **unknown)
+        unknown = dict.fromkeys(("area_px", "heading_rad", "speed_px", "middle_px"), np.nan)
+        complete_table(self, len(self.box_px), **unknown, score=1.0, label="", class_id=-1)
 
     @classmethod
     def from_supervision(cls, detections: Any) -> Self:
@@ -105,7 +104,8 @@ def _as_column(name: str, values: Any) -> np.ndarray:
         raise InputError(f"{name} of Detections cannot be an array: {error}") from None
     array = array.reshape(0, 4) if name == "box_px" and not array.size else array
     if array.ndim != (2 if name in ("box_px", "middle_px") else 1):
-        raise InputError(f"{name} of Detections must have a row for each box, got the shape {array.shape}")
+        got = f"the shape {array.shape}" if array.ndim else f"{values!r}; give a list, such as [{values!r}]"
+        raise InputError(f"{name} of Detections must have a row for each box, got {got}")
     return array
 
 

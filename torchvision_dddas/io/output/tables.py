@@ -14,6 +14,7 @@ from torchvision_dddas.io.maps.ground_tracks import semi_axes
 from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
     BOX,
+    CLASS_COLUMNS,
     COVARIANCE,
     DEGREES,
     EAST_NORTH,
@@ -30,6 +31,7 @@ from torchvision_dddas.io.tables import (
     Rows,
     Schema,
     TableFiles,
+    class_rows,
     compass_deg,
     mot_rows,
 )
@@ -46,11 +48,10 @@ from torchvision_dddas.types import (
     TrackedFrame,
 )
 
-_CLASS = (Column("class"), Column("class_id", ".0f"))
 TRACKS = Schema(
     "tracks",
     *(FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION),
-    *(Column("link", ".3f", may_be_empty=True), *_CLASS),
+    *(Column("link", ".3f", may_be_empty=True), *CLASS_COLUMNS),
 )
 """tracks.csv. kind: `detection`, `bridge` (a box between two detections), or `untracked` (without identity).
 
@@ -134,7 +135,7 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
             "heading_deg": [heading for heading, _ in moves],
             "speed_px_per_frame": [speed for _, speed in moves],
             "link": [*tracks.link.tolist(), *[None] * len(loose)],
-            **_class_rows(np.r_[tracks.label, given.label[loose]], np.r_[tracks.class_id, given.class_id[loose]]),
+            **class_rows(np.r_[tracks.label, given.label[loose]], np.r_[tracks.class_id, given.class_id[loose]]),
         }
 
     return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, rows)})
@@ -169,7 +170,7 @@ def aerial_tables(folder: Path, has_degrees: bool, grid: str = "") -> TableFiles
     Raise InputError as `check_grid` does.
     """
     check_grid(grid, has_degrees)
-    columns = *_AERIAL, *_CLASS, *_HEIGHTS, *_ERROR, *COLUMNS[grid]
+    columns = *_AERIAL, *CLASS_COLUMNS, *_HEIGHTS, *_ERROR, *COLUMNS[grid]
     schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *columns)
 
     def rows(located: AerialLocations) -> Rows:
@@ -223,7 +224,7 @@ def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> Ta
     """Open positions.csv and sightings.csv. cameras: names of the cameras."""
     schema = Schema(
         "positions",
-        *(*_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *_CLASS, *_HEIGHTS, *_ERROR),
+        *(*_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *CLASS_COLUMNS, *_HEIGHTS, *_ERROR),
     )
 
     def rows(located: GroundLocations) -> Rows:
@@ -354,7 +355,7 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResu
         own = _position_rows(located.positions)
         return {name: np.asarray(values)[confirmed.row] for name, values in own.items()} | _confirmation_rows(confirmed)
 
-    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION, *_CLASS, *_HEIGHTS, *_ERROR)
+    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION, *CLASS_COLUMNS, *_HEIGHTS, *_ERROR)
     return TableFiles({folder / "confirmed.csv": (schema, rows)}, is_optional=True)
 
 
@@ -456,12 +457,8 @@ def _position_rows(positions: Positions) -> dict[str, Any]:
         "above_ellipsoid_m": positions.above_ellipsoid_m,
         "circular_error90_m": error_m,
         "error_category": error_category(error_m),
-        **_class_rows(positions.label, positions.class_id),
+        **class_rows(positions.label, positions.class_id),
     }
-
-
-def _class_rows(label: np.ndarray, class_id: np.ndarray) -> dict[str, np.ndarray]:
-    return {"class": label, "class_id": np.where(class_id < 0, np.nan, class_id)}
 
 
 def _variances(covariance_m2: np.ndarray) -> np.ndarray:

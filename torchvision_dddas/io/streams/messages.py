@@ -106,10 +106,13 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
 def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
     """Yield the boxes that have an identity, then those without."""
     tracks, found = tracked.tracks, tracked.detections
-    columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score, tracks.link)
+    columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score, tracks.link, tracks.label)
     identified = zip(*(column.tolist() for column in columns), strict=True)
-    loose = ((None, row, found.box_px[row].tolist(), float(found.score[row]), math.nan) for row in tracked.untracked)
-    for identity, row, box, score, link in [*identified, *loose]:
+    loose = (
+        (None, row, found.box_px[row].tolist(), float(found.score[row]), math.nan, found.label[row])
+        for row in tracked.untracked
+    )
+    for identity, row, box, score, link, label in [*identified, *loose]:
         fields = {
             "id": identity,
             "kind": found.kind,
@@ -118,6 +121,8 @@ def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
             "score": _number(score, 4),
             "link": _number(link, 3),
         }
+        if label:
+            fields["class"] = label
         if row >= 0:
             heading = float(found.heading_rad[row])
             fields["heading_deg"] = _number(compass_deg(heading) if math.isfinite(heading) else math.nan, 1)

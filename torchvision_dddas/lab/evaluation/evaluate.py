@@ -1,7 +1,7 @@
 """Compare results with the truth, for one clip or many: each clip, pooled over the counts, and the mean over clips."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,17 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.detection_tables import is_mot_text, read_detections
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.lab.evaluation.metrics import boxes, pixels, tracking
+from torchvision_dddas.lab.evaluation.metrics.matching import LEAST
 from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.lab.evaluation.metrics.registry import Counts, figures, mean, pooled
 from torchvision_dddas.lab.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.lab.evaluation.metrics.truth import (
     ClipTruth,
     Ignoring,
+    MotRows,
     TrackTable,
     check_identities,
     find_truth,
@@ -28,6 +31,9 @@ from torchvision_dddas.lab.evaluation.metrics.truth import (
 from torchvision_dddas.memory import MASK
 
 DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
+_ENDINGS = (".txt", ".csv", ".json", ".xml", ".parquet")
+# True boxes of a median size below _SMALL_PX are matched at an IoU of _LOOSE too, to see how many only fit badly.
+_SMALL_PX, _LOOSE, _MANY = 16, 0.2, 0.1
 
 
 def evaluate(
@@ -36,15 +42,17 @@ def evaluate(
     first_frame: int | None = None,
     interval: int = 1,
     ignoring: Ignoring = "dropped",
+    least: float = LEAST,
 ) -> dict[str, Any]:
     """Score results: {"clips": {name: measures}, "pooled": measures, "mean": measures, "notes": [...]}.
 
-    truth and result belong to one clip (masks, boxes, tracks; a folder that dddas detect or dddas track wrote, or
-    MOTChallenge text), or are folders of clips by name. Measures are grouped as in registry.GROUPS. Raise InputError if
-    truth and result do not fit together.
+    truth and result belong to one clip (masks, boxes, tracks; a folder that dddas detect or dddas track wrote, or a
+    file that `read_detections` reads), or are folders of clips by name. Measures are grouped as in registry.GROUPS.
+    least: the IoU from which a box counts as found; HOTA always uses all thresholds. Raise InputError if truth and
+    result do not fit together.
     """
     notes: list[str] = []
-    clips = score_files(truth, result, notes, first_frame, interval, ignoring)
+    clips = score_files(truth, result, notes, first_frame, interval, ignoring, least)
     scored = {name: {"frames": clip.frames, **figures(clip.counts)} for name, clip in clips.items()}
     report = {"clips": scored, "notes": notes}
     if len(clips) > 1:
@@ -60,14 +68,19 @@ def score_files(
     first_frame: int | None = None,
     interval: int = 1,
     ignoring: Ignoring = "dropped",
+    least: float = LEAST,
 ) -> "dict[str, ClipScore]":
     """Score the clips of a result by name. Arguments and errors are those of `evaluate`."""
     if interval < 1:
         raise InputError(f"interval must be at least 1 frame, got {interval}")
-    return {
-        name: score_clip(load_truth(true_place, first_frame), load_result(found_place), notes, interval, ignoring)
-        for name, (true_place, found_place) in _pairs(truth, result, notes).items()
-    }
+    if not 0 < least <= 1:
+        raise InputError(f"the IoU from which a box counts as found must be above 0 and at most 1, got {least:g}")
+    notes += [f"boxes count as found from IoU {least:g} on; HOTA takes all"] if least != LEAST else []
+    scored = {}
+    for name, (true_place, found_place) in _pairs(truth, result, notes).items():
+        true, found = load_truth(true_place, first_frame), load_result(found_place)
+        scored[name] = score_clip(true, found, notes, interval, ignoring, least)
+    return scored
 
 
 def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path, Path]]:
@@ -79,7 +92,7 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
         name = result.resolve()
         return {name.stem if result.is_file() else name.name: (truth, result)}
     names = sorted(p.name for p in truth.iterdir() if p.is_dir()) if truth.is_dir() else []
-    places = {n: p for n in names for p in (result / f"{n}.txt", result / n) if _is_result(p)}
+    places = {n: p for n in names for p in (*(result / f"{n}{e}" for e in _ENDINGS), result / n) if _is_result(p)}
     pairs = {n: (truth / n, p) for n, p in places.items() if find_truth(truth / n) is not None}
     if not pairs:
         raise InputError(
@@ -101,7 +114,7 @@ class Result:
     """A result. frames: number of the run's last frame, 0 if unknown. state: of the run.
 
     place: the folder or file. detected: (N, 4) boxes of each frame with targets; None if only tracks were written.
-    tracks: the boxes with identities; None if there are none.
+    tracks: the boxes with identities; None if there are none. notes: how a file was read.
     """
 
     place: Path
@@ -110,6 +123,7 @@ class Result:
     has_masks: bool
     state: str
     tracks: TrackTable | None = None
+    notes: tuple[str, ...] = field(default=(), kw_only=True)
 
     @property
     def name(self) -> str:
@@ -137,19 +151,13 @@ class Result:
 
 
 def load_result(place: Path) -> Result:
-    """Read a result folder, or a file of MOTChallenge text. Raise InputError if it is neither."""
-    if place.is_file():
-        try:
-            rows = read_rows(place, "result")
-        except InputError as error:
-            if place.suffix.lower() not in (".csv", ".json", ".xml", ".parquet"):
-                raise
-            convert = f"dddas convert {place.name} {place.stem}.txt"
-            raise InputError(f"{error}. A result is MOTChallenge text: make it with {convert}") from None
+    """Read a result folder, or a file or folder that `read_detections` reads. Raise InputError if it is neither."""
+    if place.is_file() or (not _is_result(place) and any(any(place.glob(f"*.{end}")) for end in ("txt", "png"))):
+        rows, notes = _read_boxes(place)
         if not rows.named:
-            return Result(place, 0, rows.table.boxes_by_frame(), False, "complete")
+            return Result(place, 0, rows.table.boxes_by_frame(), False, "complete", notes=notes)
         check_identities(rows.table, rows.line, place)
-        return Result(place, 0, None, False, "complete", rows.table)
+        return Result(place, 0, None, False, "complete", rows.table, notes=notes)
     if not _is_result(place):
         raise InputError(
             f"{place} is not a result of dddas detect or dddas track: it holds neither {DETECTIONS} nor {TRACKS}"
@@ -175,6 +183,17 @@ def load_result(place: Path) -> Result:
     return Result(place, frames, detected, "masks" in outputs, state, tracks)
 
 
+def _read_boxes(place: Path) -> tuple[MotRows, tuple[str, ...]]:
+    """The boxes of a result in any format that dddas convert reads, and notes. Raises InputError."""
+    if is_mot_text(place):
+        return read_rows(place, "result"), ()
+    table = read_detections(place)
+    table = table[~table.of_kind("untracked")]
+    identity = np.full(len(table), -1) if table.identity is None else table.identity
+    rows = MotRows(TrackTable(table.frame, identity, table.box_px), np.ones(len(table)), table.line)
+    return rows, table.notes
+
+
 @dataclass(frozen=True)
 class ClipScore:
     """The counts of a clip by group. frames: number of scored frames. each: the counts of single frames, by group."""
@@ -185,21 +204,27 @@ class ClipScore:
 
 
 def score_clip(
-    truth: ClipTruth, result: Result, notes: list[str], interval: int = 1, ignoring: Ignoring = "dropped"
+    truth: ClipTruth,
+    result: Result,
+    notes: list[str],
+    interval: int = 1,
+    ignoring: Ignoring = "dropped",
+    least: float = LEAST,
 ) -> ClipScore:
     """Count everything that a clip's truth and result allow. Notes name what is left out.
 
-    interval: score only frames 1, 1 + interval, ... ignoring: see matching.pair. Raise InputError if truth and result
-    share no frame, or if the result lacks data that the truth needs.
+    interval: score only frames 1, 1 + interval, ... ignoring: see matching.pair. least: as for `evaluate`. Raise
+    InputError if truth and result share no frame, or if the result lacks data that the truth needs.
     """
     frames: list[int] = []
+    notes += [f"{result.name}: {note}" for note in result.notes]
     of_frames: dict[str, list[Any]] = {}
     has_tracks = truth.tracks is not None and result.tracks is not None
     if truth.kind == "masks":
         if result.tracks is not None:
             notes.append(f"{result.name}: tracks are not scored, because masks hold no identities")
         frames = _labelled(truth, result, interval, notes)
-        of_frames = _count_masks(truth, result, frames)
+        of_frames = _count_masks(truth, result, frames, least)
     elif truth.kind == "one target":
         if result.has_masks:
             frames = _labelled(truth, result, interval, notes)
@@ -211,7 +236,7 @@ def score_clip(
             )
     elif result.detected is not None or not has_tracks:
         frames = _labelled(truth, result, interval, notes)
-        of_frames = {"boxes": [boxes.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
+        of_frames = {"boxes": [boxes.match(result.boxes_at(f), truth.boxes[f], least) for f in frames]}
     counts: Counts = {}
     each: dict[str, Each] = {}
     for group, counted in of_frames.items():
@@ -221,10 +246,28 @@ def score_clip(
     scored = len(frames)
     if truth.tracks is not None and result.tracks is not None:
         length, name, found, by_frame = _count_tracks(
-            truth, truth.tracks, result, result.tracks, notes, interval, ignoring
+            truth, truth.tracks, result, result.tracks, notes, interval, ignoring, least
         )
         scored, counts[name], each[name] = max(scored, length), found, by_frame
+    if truth.kind == "boxes":
+        notes += _note_small(truth, result, interval, least)
     return ClipScore(scored, counts, each)
+
+
+def _note_small(truth: ClipTruth, result: Result, interval: int, least: float) -> list[str]:
+    """Return a note if true boxes are so small that many are missed by their IoU alone."""
+    frames = [f for f in truth.frames if (f - 1) % interval == 0]
+    sides_px = np.sqrt(np.concatenate([truth.boxes[f][:, 2:].prod(axis=1) for f in frames] or [np.zeros(0)]))
+    if not len(sides_px) or (median_px := np.median(sides_px)) >= _SMALL_PX or least <= _LOOSE:
+        return []
+    loose, hit = (
+        sum(boxes.match(result.boxes_at(f), truth.boxes[f], iou).hit for f in frames) for iou in (_LOOSE, least)
+    )
+    if loose - hit <= _MANY * len(sides_px):
+        return []
+    size = f"the median true box is as large as a square of {median_px:.0f} px, which an offset of few pixels misses"
+    more = f"IoU {_LOOSE} finds {loose - hit} more of {len(sides_px)} boxes than IoU {least:g}"
+    return [f"{result.name}: {size}: {more}; --iou {_LOOSE} counts them as found"]
 
 
 def _labelled(truth: ClipTruth, result: Result, interval: int, notes: list[str]) -> list[int]:
@@ -249,7 +292,7 @@ def _labelled(truth: ClipTruth, result: Result, interval: int, notes: list[str])
     return frames
 
 
-def _count_masks(truth: ClipTruth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
+def _count_masks(truth: ClipTruth, result: Result, frames: list[int], least: float) -> dict[str, list[Any]]:
     if not result.has_masks:
         raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
     counted: dict[str, list[Any]] = {"pixels": [], "boxes": []} if truth.labels.separate else {"pixels": []}
@@ -262,7 +305,7 @@ def _count_masks(truth: ClipTruth, result: Result, frames: list[int]) -> dict[st
             )
         counted["pixels"].append(pixels.count(mask, labels))
         if truth.labels.separate:
-            counted["boxes"].append(boxes.match(result.boxes_at(f), boxes.boxes_of(labels)))
+            counted["boxes"].append(boxes.match(result.boxes_at(f), boxes.boxes_of(labels), least))
     return counted
 
 
@@ -274,6 +317,7 @@ def _count_tracks(
     notes: list[str],
     interval: int,
     ignoring: Ignoring,
+    least: float,
 ) -> tuple[int, str, TrackCounts | TargetTrack, Each]:
     """Count tracks on every frame of the clip, labelled or not: a box in a frame without labels is false."""
     labelled = max(truth.frames[-1], truth.length)
@@ -302,7 +346,7 @@ def _count_tracks(
     if truth.kind == "one target":
         return frames, "target_track", *tracking.count_one_target(cut(true), cut(found))
     ignored = None if truth.ignored is None else cut(truth.ignored)
-    return frames, "tracks", *tracking.count(cut(true), cut(found), ignored, ignoring, interval)
+    return frames, "tracks", *tracking.count(cut(true), cut(found), ignored, ignoring, interval, least)
 
 
 def _of(interval: int) -> str:

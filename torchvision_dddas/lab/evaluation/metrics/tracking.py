@@ -113,14 +113,15 @@ def count(
     ignored: TrackTable | None = None,
     ignoring: Ignoring = "dropped",
     interval: int = 1,
+    least: float = LEAST,
 ) -> tuple[TrackCounts, Each]:
     """Count one clip's tracks, of every interval-th frame, against the truth; also for each frame that has any box.
 
     For each frame: the counts of CLEAR; windows_K: whether a window of K frames ends there; ar_K: its ratio. The counts
-    of HOTA and IDF1 belong to whole tracks. ignored, ignoring: see `matching.pair`.
+    of HOTA and IDF1 belong to whole tracks. ignored, ignoring: see `matching.pair`. least: the IoU for CLEAR and IDF1.
     """
     clip = pair(truth, found, ignored, ignoring)
-    clear, each = count_clear(clip)
+    clear, each = count_clear(clip, least)
     columns: Each = {"frame": clip.numbers, **dict(zip(PER_FRAME, each.T, strict=True))}
     links = []
     for size in (2, 3):
@@ -129,7 +130,7 @@ def count(
         columns[f"windows_{size}"] = np.array([frame in ratios for frame in clip.numbers.tolist()], float)
         columns[f"ar_{size}"] = np.array([ratios.get(frame, 0.0) for frame in clip.numbers.tolist()], float)
     sizes = len(clip.true_boxes), len(clip.found_boxes)
-    return TrackCounts(clear, count_identity(clip), count_hota(clip), *sizes, *links), columns
+    return TrackCounts(clear, count_identity(clip, least), count_hota(clip), *sizes, *links), columns
 
 
 def measures(counts: TrackCounts) -> dict[str, float]:

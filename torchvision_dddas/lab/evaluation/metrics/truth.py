@@ -133,7 +133,10 @@ def load_truth(place: Path, first_frame: int | None = None) -> ClipTruth:
         raise InputError(f"no truth at {place}")
     found = find_truth(place)
     if found is None:
-        raise InputError(f"{place} holds no truth: wanted numbered PNG masks, boxes_xywh.txt or a MOTChallenge gt.txt")
+        inside = place / "truth" / "gt.txt"  # of dddas simulate
+        more = f"; {inside} holds the true boxes of this film: give it" if inside.is_file() else ""
+        wanted = "wanted numbered PNG masks, boxes_xywh.txt or a MOTChallenge gt.txt"
+        raise InputError(f"{place} holds no truth: {wanted}{more}")
     if found.is_dir():
         numbers = _numbered(found)
         first = first_frame if first_frame is not None else 0 if 0 in numbers else 1

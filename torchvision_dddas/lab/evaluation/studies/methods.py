@@ -11,6 +11,7 @@ from torchvision_dddas.io.atomic_files import cannot_write, claimed, save_file
 from torchvision_dddas.io.output import finite, read_run_record, versions
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.evaluate import score_files
+from torchvision_dddas.lab.evaluation.metrics.matching import LEAST
 from torchvision_dddas.lab.evaluation.metrics.truth import Ignoring, find_truth
 from torchvision_dddas.lab.evaluation.report.methods import save_methods
 from torchvision_dddas.lab.evaluation.studies.comparison import compare_methods
@@ -27,6 +28,7 @@ def write_methods(
     first_frame: int | None = None,
     interval: int = 1,
     ignoring: Ignoring = "dropped",
+    least: float = LEAST,
 ) -> dict[str, Any]:
     """Score the results of methods by name. Write a study of each, and a comparison with the first, into a folder.
 
@@ -38,7 +40,8 @@ def write_methods(
     notes: list[str] = []
     with claimed(folder):
         cases = {
-            name: _score(name, truth, place, notes, first_frame, interval, ignoring) for name, place in results.items()
+            name: _score(name, truth, place, notes, first_frame, interval, ignoring, least)
+            for name, place in results.items()
         }
         shared = set.intersection(*({(case.task, case.clip.name) for case in mine} for mine in cases.values()))
         if not shared:
@@ -84,11 +87,18 @@ def name_results(places: Sequence[Path], names: Sequence[str]) -> dict[str, Path
 
 
 def _score(
-    method: str, truth: Path, result: Path, notes: list[str], first_frame: int | None, interval: int, ignoring: Ignoring
+    method: str,
+    truth: Path,
+    result: Path,
+    notes: list[str],
+    first_frame: int | None,
+    interval: int,
+    ignoring: Ignoring,
+    least: float,
 ) -> list[Case]:
     """Return the cases of a method. A single clip gets the truth's name, because its file has the method's name."""
     own: list[str] = []
-    scored = score_files(truth, result, own, first_frame, interval, ignoring)
+    scored = score_files(truth, result, own, first_frame, interval, ignoring, least)
     notes += [f"{method}: {note}" for note in own]
     if find_truth(truth) is not None:
         scored = {_clip_name(truth): next(iter(scored.values()))}
