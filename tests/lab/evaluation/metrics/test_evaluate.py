@@ -90,7 +90,7 @@ def test_masks_of_an_interrupted_run_are_scored_as_far_as_they_go(tmp_path):
         ({"00000": SQUARE[:20]}, r"frame 1: the truth is 40×20 .* the result 40×30"),
         ({"00000": SQUARE, "00009": SQUARE}, r"has 2 frames, but .* labels frame 10"),
         ({"00000": SQUARE, "00001": SQUARE}, r"000002\.png is missing"),
-        ({}, r"00000\.png is no picture"),
+        ({}, r"00000\.png cannot be read as a picture"),
     ],
 )
 def test_masks_that_do_not_fit_are_named(tmp_path, labelled, line):
