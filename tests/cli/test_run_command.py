@@ -423,7 +423,7 @@ def test_the_same_clip_without_telemetry_says_that_its_scale_is_not_known(dddas,
     ):
         result = dddas("detect", flown / "clip", "--rate", RATE_HZ, *words, "--save", "none", "--out", tmp_path)
         assert result.exit_code == 0 and "scale: " in result.stdout and said in result.stdout, result.output
-        assert ("--config patrol takes people to be" in result.stderr) == bool(words)
+        assert ("--config patrol assumes people of about" in result.stderr) == bool(words)
 
 
 def test_patrol_beside_a_configuration_on_which_it_has_no_effect_is_refused(dddas, flown):

@@ -45,7 +45,7 @@ def test_results_and_truth_are_places_on_the_same_earth(made):
 def test_the_command_that_is_proposed_evaluates_the_run(made, dddas):
     folder, said = made
     words = ("evaluate", folder / "truth" / "gt.txt", folder)
-    assert f"boxes in the picture, not places as above, are scored by dddas {' '.join(map(str, words))}\n" in said
+    assert f"boxes in the picture (not places, as above) are scored by dddas {' '.join(map(str, words))}\n" in said
     result = dddas(*words)
     assert result.exit_code == 0, result.output
     assert "HOTA" in result.stdout
