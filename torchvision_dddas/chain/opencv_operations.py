@@ -283,9 +283,9 @@ def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int
 def regional_medians(values: np.ndarray, mask: np.ndarray, least: float, most: float) -> np.ndarray:
     """Return the (R, C) float32 medians of values in regions of REGION_PX, clipped to least..most.
 
-    values, mask: (h, w), every SAMPLED-th row and column. most: median of the whole picture. A region of which the mask
-    covers at most 10 % has the value `least`, so that the noise of other regions does not hide its targets. A median
-    filter removes outliers among the regions.
+    values, mask: (h, w), every SAMPLED-th row and column. most: median of the whole picture. If the mask covers at
+    most 10 % of a region, the region has the value `least`. The noise of other regions then does not hide targets in
+    it. A median filter removes outliers among the regions.
     """
     side = REGION_PX // SAMPLED
     rows, columns = (-(-length // side) for length in values.shape)

@@ -23,7 +23,7 @@ Odd = Annotated[int, AfterValidator(odd)]
 
 
 def parameter(default: Any, meaning: str, unit: str = "-", low: float | None = None, high: float | None = None) -> Any:
-    """Define a field of a group by default, meaning, unit (`-` for a number without a unit) and inclusive range."""
+    """Define a field of a group by its default, meaning, unit (`-` for a number without a unit) and inclusive range."""
     return Field(default, ge=low, le=high, description=meaning, json_schema_extra={"unit": unit})
 
 

@@ -11,8 +11,8 @@ _CELL_PX = 8
 # Successive different pictures differ by at least 34 in some cell for moving cameras, and by 37 for a fixed camera with
 # walkers in view.
 _MOST_LEVELS = 12.0
-# A repeat differs by at most _SHARE of the largest difference among the _RECENT latest pictures. A fixed camera on a
-# still scene has noise only, which varies less than that, so that its pictures do not count as repeats.
+# A repeat differs by at most _SHARE of the largest difference among the _RECENT latest pictures. Pictures of a still
+# scene by a fixed camera differ by noise only. The noise varies less, so these pictures do not count as repeats.
 _SHARE, _RECENT = 0.25, 12
 # If the mean difference of two pictures exceeds this, some cell differs by more than in any repeat.
 _CHANGED_LEVELS = 2.5

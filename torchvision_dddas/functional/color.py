@@ -97,7 +97,7 @@ def rgb_histogram(
     inside = (down < tall[..., None])[..., :, None] & (across < wide[..., None])[..., None, :]
     place = (v[..., :, None] * width + u[..., None, :]).flatten(1)
     pixels = image.flatten(2).gather(2, place[:, None].expand(-1, 3, -1))
-    # In the histogram of its box, every pixel counts in the level, or in the two levels, nearest to it.
+    # Every pixel is counted in the histogram of its box: in the nearest level, or in the two nearest levels.
     level = pixels.clamp(0, 1) * (BINS - 1)
     weight = inside.flatten(1)[:, None].to(pixels.dtype).expand_as(level)
     batch, boxes = valid.shape

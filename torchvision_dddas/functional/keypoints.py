@@ -110,7 +110,7 @@ def frame_features(
     value, index = value.topk(min(4 * count, value.shape[1]))
     width = gray.shape[-1]
     points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
-    is_near = (torch.cdist(points, points) < min_distance_px).tril(-1)  # to a better corner
+    is_near = (torch.cdist(points, points) < min_distance_px).tril(-1)  # a better corner is near
     found = kept = value > 0
     while True:  # decide from the best corner on; every round decides at least one more corner
         before, kept = kept, found & ~(is_near & kept[:, None]).any(2)

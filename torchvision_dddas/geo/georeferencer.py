@@ -318,7 +318,7 @@ class Georeferencer:
 
     @property
     def _state(self) -> tuple[list[BiasFilter], np.ndarray, tuple[dict[int, int], list[int]]]:
-        """The state that a frame changes, except for the misfit."""
+        """The variables that locating a frame changes, except for the misfit."""
         return list(self._filters), self._likelihood, self._repair
 
     @_state.setter

@@ -241,7 +241,7 @@ def announced_hz(capture: Capture) -> float | None:
 
 
 def _check_size(target: str | int, name: str, width: int, height: int) -> None:
-    is_file = isinstance(target, str) and not is_live(target) and Path(target).is_file()  # unlike frame%d.png
+    is_file = isinstance(target, str) and not is_live(target) and Path(target).is_file()  # not frame%d.png
     size = Path(str(target)).stat().st_size if is_file else None
     check_memory(VIDEO * width * height, f"{name} has frames of {width}x{height} pixels", size)
 

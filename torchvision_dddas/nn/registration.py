@@ -258,7 +258,7 @@ class _FramePairs(NamedTuple):
 
 
 def _drawn(hypotheses: int, count: int, size: int) -> Int64[Tensor, "1 S size"]:
-    """Return the same numbers of keypoints in every call."""
+    """Draw the keypoints of each hypothesis, by their numbers. Every call draws the same numbers."""
     if F.is_traced():  # a graph holds no generator, so the numbers are its constants
         numbers = np.random.default_rng(0).permuted(np.tile(np.arange(count), (hypotheses, 1)), axis=1)
         return torch.tensor(numbers[None, :, :size].tolist())

@@ -284,9 +284,9 @@ def read_locator(
 ) -> tuple[AerialLocator, list[str]]:
     """Make the aerial locator from files, and return it with notes for the user.
 
-    size: (width, height) of the pictures; rate_hz; frames: numbers of the first and last; each None if unknown.
-    what: owner of these frames, for messages. clip: the video, as for `read_telemetry`. colours: if given, landmarks
-    are found by colour in the pictures, even if the table has pixels. extent: as for `resolve_camera`.
+    size: (width, height) of the pictures. frames: numbers of the first and last frame. size, rate_hz, frames: None if
+    unknown. what: name of the clip or table in messages. clip: the video, as for `read_telemetry`. colours: if given,
+    find the landmarks by colour in the pictures, even if their table has pixels. extent: as for `resolve_camera`.
     Raise InputError for bad input.
     """
     offset = settings.aerial.clock_offset_s

@@ -40,7 +40,7 @@ class _Blob:
 
     @property
     def is_settled(self) -> bool:
-        """Whether it has been seen long enough to have events."""
+        """Whether the blob has been seen long enough to have events."""
         return self.last_s - self.first_s >= _SETTLED_S
 
     def follow(self, before: "_Blob") -> None:

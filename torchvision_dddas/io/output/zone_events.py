@@ -56,9 +56,9 @@ def event_fields(event: ZoneEvent, start_utc_s: float = math.nan) -> dict[str, A
 
 
 class ZoneCounts:
-    """Counts events. rows: number of targets, classes, and events by kind of each zone.
+    """Counts events. rows: for each zone the numbers of targets, of targets by class, and of events by kind.
 
-    crowds: events of crowds, by kind.
+    crowds: number of crowd events by kind.
     """
 
     def __init__(self, zones: Sequence[Zone]) -> None:

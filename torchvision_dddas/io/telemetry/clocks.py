@@ -291,7 +291,7 @@ def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[Sequence[TimeColumn]
 
 
 def _restarts(values: np.ndarray) -> list[int]:
-    """Return rows in which a column of times restarts; none if there are many, because it holds no times then."""
+    """Return rows in which a column of times restarts. A column with many restarts holds no times: return no rows."""
     known = np.flatnonzero(np.isfinite(values))
     back = known[1:][np.diff(values[known]) < -1.0]
     highest = np.fmax.accumulate(values)

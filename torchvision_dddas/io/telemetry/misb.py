@@ -43,10 +43,10 @@ class Piece(NamedTuple):
 
 
 def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float) -> Telemetry:
-    """Read MISB ST 0601 metadata. layout: the transport stream's `spacing`; None for bare local sets.
+    """Read MISB ST 0601 metadata. layout: `spacing` of the transport stream; None: the file holds local sets only.
 
-    Times are those of the stream, since its first picture. If they are missing, times are the sets' own stamps, with
-    the first stamp at the last picture before it. Raise InputError if no metadata is intact.
+    Times come from the stream and count from its first picture. If the stream has no times, they come from the stamps
+    in the sets. The first stamp is then set to the last picture before it. Raise InputError if no metadata is intact.
     """
     log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0, height_zero="ground")
     content = path.read_bytes()

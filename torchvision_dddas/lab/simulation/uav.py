@@ -165,7 +165,7 @@ class Aircraft:
 class ReportedPose:
     """Errors of the UAV's telemetry: lasting errors with the parameters' sigmas, and new errors a tenth as large.
 
-    In a view straight down, a tiny tilt changes the reported heading much, and the roll compensates for it.
+    If the camera looks straight down, a tiny tilt changes the reported heading much; the roll changes equally.
     """
 
     def __init__(self, parameters: AircraftParameters, seed: int) -> None:

@@ -256,7 +256,7 @@ def shadow_above_ground(heights_m: np.ndarray, texel_m: float, to_sun: np.ndarra
     if level < 1e-3:
         return np.full(heights_m.shape, -1, np.float32)
     sink = texel_m * to_sun[2] / level
-    # Rows of the turned map go away from the sun. Columns of matrix: world (column, row) per turned column and row.
+    # Rows of the turned map go away from the sun. matrix maps its (column, row, 1) to the (column, row) of the world.
     away = np.array([-to_sun[0], to_sun[1]]) / level
     aside = np.array([away[1], -away[0]])
     size = int(np.ceil(np.hypot(rows, columns))) + 2

@@ -144,7 +144,7 @@ def _compare(goal: Goal, cases: Sequence[Sequence[Case]], clips: tuple[str, ...]
 
 
 def _say_change(goal: Goal, changes: Mapping[str, Any] | None) -> str:
-    """Return the answer of `compare_studies`, but not corrected for measures that nobody asked about."""
+    """Return the verdict of `compare_studies` on the goal's measure, without the correction for many measures."""
     entry = (changes or {"tasks": {}})["tasks"].get(goal.task, {"pooled": {}})["pooled"].get(goal.group, {})
     entry = entry.get(goal.measure)
     return "" if entry is None else verdict(entry, goal.measure, "p")

@@ -141,7 +141,7 @@ def upstream_task(clip: Clip, task: Task) -> Task | None:
 
 
 def narrow_settings(settings: Settings, task: Task) -> Settings:
-    """Return the settings of a stage: groups that its key in the cache does not contain have their defaults."""
+    """Return the settings of a stage. Groups that are not part of the stage's cache key get their defaults."""
     return Settings().model_copy(update={group: getattr(settings, group) for group in PARAMETER_GROUPS[task]})
 
 

@@ -42,9 +42,9 @@ def summarize(results: Results) -> dict[str, Any]:
     {"tasks": {task: {"clips": {name: {"frames": F, group: {measure: value}, "intervals": {group: {measure: [low, high]
     or None}}}}, "pooled": {group: ..., "intervals": ..., "over": {group: "clips" or "frames"}}, "mean": {group:
     {measure: value}}, "worst": {group: {measure: {"clip": name, "value": value}}}, "notes": [...]}}, "left_out":
-    [...]}. Groups, measures and n_ counts are those of `dddas evaluate`, and also ranking, still, location and metres.
-    The interval of a clip is over blocks of its frames. The interval of all clips is over clips if there are enough,
-    else over blocks of frames, which holds only for these clips.
+    [...]}. `dddas evaluate` has the same groups, measures and n_ counts, except the groups ranking, still, location and
+    metres. The interval of a clip comes from resampling blocks of its frames. The interval of all clips comes from
+    resampling clips; with too few clips it comes from blocks of frames, and holds for these clips only.
     """
     tasks: dict[str, Any] = {}
     for task, meaning in TASKS.items():
