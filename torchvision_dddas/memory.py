@@ -33,7 +33,7 @@ def check_memory(needed: float, what: str, size: int | None = None, advice: str 
     """Raise InputError if an input would take more than its budget.
 
     needed: bytes. what: the input and the size in its header, for the message. size: bytes of the file, if any.
-    advice: what the user can do.
+    advice: advice to the user.
     """
     given = os.environ.get(VARIABLE, "")
     if given and not (given.isascii() and given.isdigit() and len(given) < 12 and int(given)):

@@ -55,7 +55,7 @@ class PlatformLook:
 
 @dataclass(frozen=True)
 class FurtherUav:
-    """A further UAV, whose clip is tracked and located separately. start_utc_s: of its clip, NaN if unknown."""
+    """A further UAV, whose clip is tracked and located separately. start_utc_s: start of its clip, NaN if unknown."""
 
     file: Platform
     results: Iterable[FrameResult]

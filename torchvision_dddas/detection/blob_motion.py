@@ -8,7 +8,7 @@ import numpy as np
 
 from torchvision_dddas.detection.blobs import Blob, Box
 
-# Slower motion, px a frame, cannot be told from registration errors.
+# Slower motion, px a frame, cannot be distinguished from registration errors.
 _MIN_SPEED_PX = 0.5
 # As shares of the speed: the largest disagreement of two flows that counts as steady motion, and the smallest
 # difference from the surroundings that counts as motion of its own.

@@ -16,7 +16,7 @@ from torchvision_dddas.runtime import open_session
 from torchvision_dddas.types import Detections, Frame, as_picture
 
 _GREY = 114  # beside the picture, as YOLOs are trained
-_USUAL_PX, _STRIDE = 640, 32  # of an input whose size is free
+_USUAL_PX, _STRIDE = 640, 32  # default size of an input with free sides
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _MOST_BOXES = 1000  # of a frame, the likeliest
 
@@ -27,8 +27,8 @@ class OnnxDetector:
     >>> for result in td.Pipeline(detector=td.OnnxDetector("yolo11n.onnx"))("clip.mp4"):  # doctest: +SKIP
     ...     print(result.tracks.label)
 
-    layout: how its outputs are read. size_px: (width, height) of its input. names: the classes by number. notes: what
-    was assumed, such as classes without names.
+    layout: layout of its outputs. size_px: (width, height) of its input. names: the classes by number. notes:
+    assumptions, such as classes without names.
     """
 
     def __init__(
@@ -39,12 +39,12 @@ class OnnxDetector:
         score: float = 0.25,
         classes: Sequence[str] | str | Path | None = None,
     ) -> None:
-        """path: of the file. provider: cpu, cuda, openvino or another that the installed ONNX Runtime has.
+        """path: the ONNX file. provider: cpu, cuda, openvino or another that the installed ONNX Runtime has.
 
         score: boxes below it are left out. classes: names in the order of their numbers, or a text file with a name a
-        line; None: those of the file, or of the config.json beside it.
-        Raises InputError for a file that ONNX Runtime cannot open, inputs or outputs of an unknown layout, a provider
-        that is not there, and another number of names than classes.
+        line; None: take the names of the file, or of the config.json beside it.
+        Raises InputError for a file that ONNX Runtime cannot open, inputs or outputs of an unknown layout, a missing
+        provider, or a number of names that differs from the number of classes.
         """
         self.path, self.notes = Path(path), list[str]()
         if not 0 <= score <= 1:
@@ -78,7 +78,7 @@ class OnnxDetector:
         return {**facts, "provider": self.provider, "classes": list(self.names.values())}
 
     def __call__(self, frame: Frame | np.ndarray) -> Detections:
-        """The boxes of a frame, best first, with the names and numbers of their classes."""
+        """Return the boxes of a frame, best first, with the names and numbers of their classes."""
         image = as_picture(frame.image if isinstance(frame, Frame) else frame)
         size = image.shape[1], image.shape[0]
         fitted = self._adapt_size(size) if self._adapts else self.size_px
@@ -98,7 +98,7 @@ class OnnxDetector:
         return Detections(box, score, box[:, 2:].prod(axis=1), kind="given", label=label, class_id=number)
 
     def _find_image(self) -> str:
-        """The name of the input that takes the picture. Raises InputError if there is none."""
+        """Return the name of the input that takes the picture. Raise InputError if no input does."""
         for name, given in self._inputs.items():
             if len(given.shape) == 4 and given.type in _TYPES and _fixed(given.shape[:2], (1, 3)) == [1, 3]:
                 return name
@@ -106,7 +106,7 @@ class OnnxDetector:
         raise InputError(f"{self.path} takes {shown}; wanted one picture, float32 or float16 of shape (1, 3, H, W)")
 
     def _choose_size(self, metadata: Mapping[str, str], beside: Mapping[str, Any]) -> Size:
-        """The input's size; where it is free, the one of training, else _USUAL_PX."""
+        """Return the size of the input. A free side gets its size in training, or _USUAL_PX if it is unknown."""
         trained = _literal(metadata.get("imgsz"))
         if not isinstance(trained, list | tuple) or len(trained) != 2:
             given = beside["size"] if isinstance(beside.get("size"), dict) else {}
@@ -115,13 +115,13 @@ class OnnxDetector:
         return width, height
 
     def _adapt_size(self, size: Size) -> Size:
-        """An input of the picture's shape, not larger than that of training save to be a multiple of _STRIDE."""
+        """Return the input size for a picture: the training size or less, rounded up to multiples of _STRIDE."""
         ratio = min(self.size_px[0] / size[0], self.size_px[1] / size[1])
         width, height = (-(-round(side * ratio) // _STRIDE) * _STRIDE for side in size)
         return width, height
 
     def _tell_layout(self, metadata: Mapping[str, str], beside: Mapping[str, Any]) -> Layout:
-        """The layout of the outputs for a grey picture. Raises InputError as `tell_layout`."""
+        """Return the layout of the outputs by a run on a grey picture. Raise InputError as `tell_layout` does."""
         task = metadata.get("task", "detect")
         if task not in ("detect", "segment", "pose"):
             raise InputError(f"{self.path} is a network for '{task}'; wanted one that detects boxes")
@@ -141,7 +141,7 @@ class OnnxDetector:
         return layout
 
     def _run(self, blob: np.ndarray) -> dict[str, np.ndarray]:
-        """The outputs, in float32, of a picture (1, 3, H, W)."""
+        """Return the outputs for a picture (1, 3, H, W), in float32."""
         given = {self._image: blob.astype(_TYPES[self._inputs[self._image].type])}
         for name, other in self._inputs.items():
             if name == "orig_target_sizes":
@@ -156,7 +156,7 @@ class OnnxDetector:
 
 
 def fit_picture(image: np.ndarray, size: Size, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A network's input (1, 3, H, W) of a picture, and the scale (2,) and offset (2,) from the picture to it.
+    """Return a network's input (1, 3, H, W) for a picture, and the scale (2,) and offset (2,) from picture to input.
 
     The point (x, y) of the picture lies at scale * (x, y) + offset of the input, in pixels from the outer corner.
     """
@@ -165,7 +165,7 @@ def fit_picture(image: np.ndarray, size: Size, layout: Layout) -> tuple[np.ndarr
     if layout.fit != "stretch":
         inner = np.maximum(1, np.round(whole * (wanted / whole).min())).astype(int)
     offset = (wanted - inner) // 2 if layout.fit == "centre" else np.zeros(2, int)
-    # YOLOs are trained on pictures that OpenCV reduced so, the others on smoothly reduced ones.
+    # YOLO is trained on pictures that OpenCV reduced linearly. Other networks are trained on smoothly reduced pictures.
     way = cv2.INTER_AREA if layout.fit == "stretch" and (inner < whole).all() else cv2.INTER_LINEAR
     colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
     canvas = np.full((size[1], size[0], 3), _GREY, np.uint8)
@@ -177,7 +177,7 @@ def fit_picture(image: np.ndarray, size: Size, layout: Layout) -> tuple[np.ndarr
 
 
 def _fixed(sides: Sequence[Any], otherwise: Sequence[Any]) -> list[int]:
-    """The sides of an input; the other ones where they are free."""
+    """Return the sides of an input. Free sides are replaced by the sides in `otherwise`."""
     return [side if isinstance(side, int) else int(other) for side, other in zip(sides, otherwise, strict=True)]
 
 
@@ -189,14 +189,14 @@ def _literal(text: str | None) -> Any:
 
 
 def _known_names(metadata: Mapping[str, str], beside: Mapping[str, Any]) -> dict[int, str]:
-    """The names of classes in the file's metadata, as of ultralytics, or in a config.json, as of transformers."""
+    """Return the class names from the file's metadata (ultralytics) or from a config.json (transformers)."""
     given = _literal(metadata.get("names")) or beside.get("id2label")
     pairs = given.items() if isinstance(given, dict) else enumerate(given if isinstance(given, list) else ())
     return {int(number): str(name) for number, name in pairs if str(number).isdecimal()}
 
 
 def _read_names(given: Sequence[str] | str | Path) -> dict[int, str]:
-    """Names of a sequence or of a text file. Raises InputError for a file that cannot be read or is empty."""
+    """Return the names of a sequence or a text file. Raise InputError if the file cannot be read or is empty."""
     if not isinstance(given, str | Path):
         return dict(enumerate(map(str, given)))
     try:
@@ -209,7 +209,7 @@ def _read_names(given: Sequence[str] | str | Path) -> dict[int, str]:
 
 
 def _read_beside(path: Path) -> dict[str, Any]:
-    """The content of config.json and preprocessor_config.json of transformers in the file's folder or the one above."""
+    """Return config.json and preprocessor_config.json (transformers) from the file's folder or its parent folder."""
     content: dict[str, Any] = {}
     for name in ("config.json", "preprocessor_config.json"):
         file = next((f for f in (path.parent / name, path.parent.parent / name) if f.is_file()), None)

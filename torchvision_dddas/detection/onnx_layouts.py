@@ -1,4 +1,4 @@
-"""The outputs of detection networks: the usual exports of YOLO and DETR, told apart by their names and shapes."""
+"""The outputs of detection networks: the usual exports of YOLO and DETR, recognized by their names and shapes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,8 +46,8 @@ class Layout:
     """How a network wants its picture, and how its outputs become boxes.
 
     fit: the picture keeps its shape in the middle (centre) or at the top left (corner) of a grey input, or is stretched
-    over it. mean, spread: of the input's three channels, in grey levels. overlap: of two boxes of one class that share
-    more of their union, the worse is dropped; 1 for networks that do this. classes: their number; 0 if unknown.
+    over it. mean, spread: normalization of the input's three channels, in grey levels. overlap: drop the worse of two
+    boxes of a class with a larger IoU; 1 for networks that do this. classes: their number; 0 if unknown.
     """
 
     name: str
@@ -63,9 +63,9 @@ class Layout:
 def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, softmax: bool | None = None) -> Layout:
     """Tell the layout from the outputs of a network for a grey picture.
 
-    is_final: whether the network takes the size of the picture and gives boxes in its pixels. names: how many classes
-    the file names, 0 if it names none. softmax: whether the last class of a DETR is "no object"; None: if it has 100
-    queries, as the first DETR. Raises InputError for an unknown layout.
+    is_final: whether the network takes the size of the picture and gives boxes in its pixels. names: number of classes
+    that the file names. softmax: whether the last class of a DETR is "no object"; None: yes if it has 100 queries, as
+    the first DETR has. Raise InputError for an unknown layout.
     """
     shapes = {name: values.shape for name, values in outputs.items()}
     if {"logits", "pred_boxes"} <= shapes.keys():
@@ -89,7 +89,7 @@ def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, so
 
 
 def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int) -> Layout | None:
-    """The layout of a single table. Masks and keypoints follow the classes, whose number `names` then tells."""
+    """Return the layout of a single table. names: number of classes; it tells classes from masks and keypoints."""
     _, rows, columns = table.shape
     cells = [sum((size[0] // s) * (size[1] // s) for s in strides) for strides in _STRIDES]
     is_turned = columns in cells and rows > 4
@@ -112,7 +112,7 @@ def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int) -> Layout | 
 
 
 def _best(table: np.ndarray, first: int, classes: int) -> Found:
-    """The likeliest class of rows of centre, size, objectness if `first` is 5, and classes."""
+    """Return the likeliest class of each row. Columns: centre, size, objectness (only if `first` is 5), classes."""
     share = table[:, first : first + classes] * (table[:, 4:5] if first == 5 else 1.0)
     return Found(_corners(table[:, :4]), share.max(axis=1), share.argmax(axis=1))
 
@@ -122,7 +122,7 @@ def _corners(box: np.ndarray) -> np.ndarray:
 
 
 def _decode_grid(key: str, strides: Sequence[int], classes: int, given: Outputs, size: Size) -> Found:
-    """Rows by cells of these strides, none if in pixels. Source: YOLOX, `demo_postprocess`."""
+    """Decode one row per cell of the strides; no strides: rows are in pixels. Source: YOLOX, `demo_postprocess`."""
     table, start = given[key][0].copy(), 0
     for stride in strides:
         down, across = np.mgrid[: size[1] // stride, : size[0] // stride]
@@ -133,7 +133,7 @@ def _decode_grid(key: str, strides: Sequence[int], classes: int, given: Outputs,
 
 
 def _decode_queries(logits: str, boxes: str, softmax: bool, given: Outputs, size: Size) -> Found:
-    """Boxes as shares of the picture. softmax: of the classes one is true, and the last is "no object"."""
+    """Decode boxes that are shares of the picture. softmax: classes exclude each other, the last is "no object"."""
     logit = given[logits][0]
     share = 1 / (1 + np.exp(-logit))
     if softmax:

@@ -228,7 +228,7 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
 
 def _counts(points: np.ndarray, view: OpenCVView) -> np.ndarray:
-    """Return (N,) bool: which points (N, 2) lie outside the ignored area. Points are first clipped to the picture."""
+    """Return (N,) bool: whether points (N, 2) are outside the ignored area. Points are first clipped to the picture."""
     if view.ignored is None:
         return np.ones(len(points), bool)
     u, v = np.clip(points.round().astype(int), 0, np.array(view.size) - 1).T

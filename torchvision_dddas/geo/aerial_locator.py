@@ -301,9 +301,9 @@ class AerialLocator:
     ) -> AerialLocations:
         """Locate the targets of a frame, and leave out those that the fix cannot place.
 
-        adjustments, seconds: those of the earlier stages, for the record. motion: (3, 3) pixel homography from the
-        frame located before, None if unknown. By telemetry alone, velocities are relative to the ground as the pictures
-        show it, because log errors that change between frames move standing targets too.
+        adjustments, seconds: adjustments and times of the earlier stages, for the record. motion: (3, 3) pixel
+        homography from the frame located before, None if unknown. By telemetry alone, velocities are relative to the
+        ground as the pictures show it, because log errors that change between frames move standing targets too.
         """
         start, fix, origin = time.perf_counter(), fixed.fix, self.site.origin_deg
         # The covariance relative to the team is the sum of a part of each box alone and a part that all boxes share.
@@ -464,7 +464,7 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
 
 
 def is_outside(locator: AerialLocator, pixels: np.ndarray) -> np.ndarray:
-    """(N,) bool, which pixels (N, 2) lie far beyond the picture's edges; none where the picture's size is unknown."""
+    """Return (N,) bool: whether pixels (N, 2) lie far beyond the picture's edges. False if its size is unknown."""
     if locator.settings.aerial.mode != "pose":
         return np.zeros(len(pixels), bool)
     size = np.array(locator.camera.size_px, float)

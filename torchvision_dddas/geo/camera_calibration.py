@@ -62,10 +62,10 @@ def calibrate_pose(
 ) -> MountedPose:
     """Estimate the camera's height and pitch from boxes of upright people that the picture's border does not cut.
 
-    box_px: in the order of time. height_sigma: standard deviation of a box's height, in heights; boxes with much larger
-    residuals get little weight. miss: the median residual, in box heights.
-    Raise InputError if fewer than FEWEST boxes lie where the lens can show them, if they do not determine the pose (all
-    feet in one row), or if no pose fits them.
+    box_px: boxes in the order of time. height_sigma: standard deviation of a box's height, in heights; boxes with much
+    larger residuals get little weight. miss: the median residual, in box heights. Raise InputError if fewer than FEWEST
+    boxes lie where the lens can show them, if they do not determine the pose (all feet in one row), or if no pose fits
+    them.
     """
     box = np.asarray(box_px, float).reshape(-1, 4)
     u = box[:, 0] + box[:, 2] / 2 - 0.5

@@ -121,7 +121,7 @@ def find_clock_offset(
         return clip.between(begin + offset_s, end + offset_s)
 
     def refine(offset_s: float) -> tuple[float, float, float, float]:
-        """Return the likelihood of the best offset near one, that offset, its sigma, and the independent turns."""
+        """Search the best offset near one. Return its likelihood, the offset, its sigma and the independent turns."""
         sigma_s = count = 0.0
         for _ in range(_REFINEMENTS):
             slope = (seen(offset_s + _STEP_S / 10) - seen(offset_s - _STEP_S / 10)) / (_STEP_S / 5)

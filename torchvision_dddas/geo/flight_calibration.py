@@ -91,7 +91,7 @@ class FlightErrors:
 
 
 def find_looks(locator: AerialLocator, times_s: Mapping[int, float] | None = None) -> list[Look]:
-    """Return the pictures that show landmarks, with their logged poses. times_s: of frames if the rate varies.
+    """Return the pictures that show landmarks, with their logged poses. times_s: of each frame if the rate varies.
 
     Raise InputError if there are none.
     """

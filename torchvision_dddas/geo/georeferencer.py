@@ -3,7 +3,7 @@
 The errors of the telemetry and of the landmarks' receivers change slowly, so many frames estimate them. Each error is
 an Ornstein-Uhlenbeck process plus noise. Process and noise together have the stated standard deviation of the error;
 the process decays with a time constant. The first frame is therefore solved like a single picture. Later frames gain
-from what is independent, pixels and motion, and no result becomes more certain than slow errors allow.
+from independent errors only, those of pixels and motion. No result becomes more certain than the slow errors allow.
 """
 
 from collections.abc import Iterator
@@ -224,8 +224,8 @@ class BiasFilter:
 class Georeferencer:
     """Find how each frame of a clip maps to the ground. Call `update` with the frames in order.
 
-    solver: for the plane homography. focal_known: whether the camera's focal length is given, not guessed. names: names
-    of the landmarks, for messages.
+    solver: solver of the plane homography. focal_known: whether the camera's focal length is given, not guessed. names:
+    names of the landmarks, for messages.
     """
 
     def __init__(
@@ -306,7 +306,7 @@ class Georeferencer:
         self._misfit, self._misfit_s = misfit, time_s
         redundancy = misfit.redundancy
         if own.factor(IN_A_FRAME) > _MORE * factor:
-            # Only the landmarks of this frame are worse: widen its ellipses, and those of no other frame.
+            # Only the landmarks of this frame are worse: widen the ellipses of this frame only.
             after, self._state, factor, redundancy = self._state, before, own.factor(IN_A_FRAME), own.redundancy
             fix, _ = self._solve_pose(frame, time_s, flight, prior, widen_errors(marks, factor))
             self._state = after
@@ -329,7 +329,7 @@ class Georeferencer:
     def _solve_pose(
         self, frame: int, time_s: float, flight: Flight | None, prior: Prior | None, marks: LandmarkObservations
     ) -> tuple[Fix, Misfit | None]:
-        """Solve the pose with the stated errors, and return the landmarks' misfit; None if it does not tell theirs."""
+        """Solve the pose with the stated errors, and return the landmarks' misfit; None if unknown."""
         if len(marks) or self.names:
             cause = _describe_refusal(frame, prior, marks, self.parameters.least_spread)
         else:

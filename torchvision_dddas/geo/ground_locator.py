@@ -76,7 +76,7 @@ class GroundLocator:
         poses: Sequence[PoseTable | None] = (),
         rate_hz: float | None = None,
     ) -> None:
-        """poses: where each camera stood over time; None for a camera that stands still. rate_hz: for poses by time.
+        """poses: places of each camera over time; None for a standing camera. rate_hz: needed for poses with times.
 
         Raise InputError if there is no camera, if the numbers of cameras and poses differ, or for several cameras with
         ground.mode = paper.
@@ -107,7 +107,7 @@ class GroundLocator:
         self._last_number = 0
 
     def locate(self, people: People | Sequence[People], *, frame: int = 1) -> GroundLocations:
-        """Locate the people of one frame. people: of the one camera, or of each camera in order."""
+        """Locate the people of one frame. people: people seen by the camera, or the People of each camera in order."""
         seen = [people] if isinstance(people, People) else list(people)
         if not all(isinstance(one, People) for one in seen):
             raise InputError("locate expects the People of each camera, got another type")

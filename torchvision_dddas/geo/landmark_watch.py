@@ -207,9 +207,9 @@ def cut_out_landmarks(
 ) -> tuple[Detections, np.ndarray]:
     """Remove the discs around vehicles' middles from the detections, and return them with their (H, W) mask.
 
-    vehicles: which detections are landmarks. Of these, only parts outside the discs stay, if they are large enough;
-    nothing stays if a middle or radius is unknown (NaN). Parts smaller than least_px are dropped, those of landmarks if
-    smaller than four times least_px. A target that no disc touches is unchanged.
+    vehicles: whether each detection is a landmark. Of these, only parts outside the discs stay, if they are large
+    enough; nothing stays if a middle or radius is unknown (NaN). Parts smaller than least_px are dropped, those of
+    landmarks if smaller than four times least_px. A target that no disc touches is unchanged.
     """
     known = np.isfinite(middle_px).all(axis=1) & np.isfinite(radius_px)
     outside = mask.copy()

@@ -103,7 +103,7 @@ def pose_prior(
 ) -> Prior | None:
     """Return the prior of the pose by telemetry; None without place, height and angles.
 
-    flight: with its place in local metres. focal_known: the focal length is given, not guessed from a field of view.
+    flight: the telemetry in local metres. focal_known: the focal length is given, not guessed from a field of view.
     """
     if flight is None:
         return None

@@ -296,10 +296,10 @@ def resolve_camera(
 ) -> tuple[Camera, bool, list[str]]:
     """Return the aerial camera, whether its focal length is given, and notes for the user.
 
-    camera: from its file, None without one. size: (width, height) of the pictures, used if the camera has no size.
-    extent: (width, height) of all boxes, used as the size if nothing depends on the size, for example if landmarks
-    alone map pictures to the ground.
-    Raise InputError if the size is unknown, or if the camera's size is not that of the pictures.
+    camera: the camera of the camera file, None without a file. size: (width, height) of the pictures, used if the
+    camera has no size. extent: (width, height) of all boxes, used as the size if nothing depends on the size, for
+    example if landmarks alone map pictures to the ground. Raise InputError if the size is unknown, or if the camera's
+    size is not that of the pictures.
     """
     parameters, notes = settings.aerial, list[str]()
     if camera is not None:

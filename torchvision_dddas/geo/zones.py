@@ -76,7 +76,7 @@ class _Stay:
 
 @dataclass
 class _ZoneTarget:
-    """A target with its recent moments. jitter: of its places on the ground and in the picture."""
+    """A target with its recent moments. jitter: jitter of its places on the ground and in the picture."""
 
     trail: deque[_Moment] = field(default_factory=deque)
     classes: Counter[tuple[str, int]] = field(default_factory=Counter)
@@ -105,7 +105,7 @@ class Zones:
     ) -> None:
         """file: GeoJSON or KML. polygons, lines: outlines and lines of places (N, 2), by name or as a list.
 
-        unit: of these, deg (longitude and latitude in WGS84), m (local metres of the run), or px.
+        unit: unit of the points, deg (longitude and latitude in WGS84), m (local metres of the run), or px.
         dwell_s: seconds inside after which a target dwells. Raise InputError as `read_zones` and `make_zone` do.
         """
         self.zones, self.notes = ([], []) if file is None else read_zones(file)
@@ -167,7 +167,7 @@ class Zones:
     def _step(
         self, zone: Zone, number: int, now: _Moment, at: np.ndarray, inside: bool, distance: float
     ) -> Iterator[ZoneEvent]:
-        """Yield the events of a target at a zone in a frame. at: its place. distance: in margins."""
+        """Yield the events of a target at a zone in a frame. distance: from its place `at` to the zone, in margins."""
         target = self._targets[number]
         stay = target.stays.setdefault(zone.name, _Stay(now, now, at, inside))
         net, share = geometry.crossings(stay.at, at, self._edges[zone.name])

@@ -1,1 +1,1 @@
-"""The laboratory: what simulates, proves, tunes and exports the system. Only `cli` imports it."""
+"""The laboratory: simulation, evaluation, tuning and export of the system. Only `cli` imports it."""

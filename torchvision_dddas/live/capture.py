@@ -30,8 +30,8 @@ class LiveSource:
     out or lost. time_s is a recording's own; for a camera it counts from the first picture. Failures during the run
     become an event of `health` (kind `stream`) and a problem; only a driver that hangs repeatedly raises DeadCamera.
 
-    name: as given, without passwords. recorded: the number of frames of a recording, None if uncertain. busy_s: time
-    spent by the run on the previous frame. Raise InputError if the source cannot be opened or sends no picture.
+    name: the given name, without passwords. recorded: the number of frames of a recording, None if uncertain. busy_s:
+    time spent by the run on the previous frame. Raise InputError if the source cannot be opened or sends no picture.
     """
 
     count: int | None = None

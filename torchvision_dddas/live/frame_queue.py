@@ -108,7 +108,7 @@ class FrameQueue:
 
 
 class CaptureLog:
-    """Records of the capture thread. number: of the newest frame. start_utc_s, problems: as in LiveSource.
+    """Records of the capture thread. number: number of the newest frame. start_utc_s, problems: as in LiveSource.
 
     sent_hz: the latest measured rate; None before the first measurement.
     """
@@ -124,7 +124,7 @@ class CaptureLog:
         self._count, self._joined_s, self._since_s = 0, float("nan"), float("nan")
 
     def report(self, what: str, number: int | None = None, topic: str = "") -> None:
-        """Record an event and a problem. topic: of frequent events; one event of a topic is kept every 10 s."""
+        """Record an event and a problem. topic: name for frequent events, of which one is kept every 10 s."""
         now_s, number = self._clock.now(), self.number if number is None else number
         if topic and now_s - self._reported_s.get(topic, -np.inf) < _QUIET_S:
             return

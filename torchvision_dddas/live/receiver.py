@@ -39,8 +39,8 @@ class _GivenUp(Exception):
 class Receiver:
     """Read a stream in a thread of its own from the start, and fill the queue once frames are taken.
 
-    rate_hz: as given, else as announced, else measured. size: of the first picture; it follows a stream that changes.
-    waiting: as in LiveSource. Raise InputError if no first picture comes.
+    rate_hz: the given rate, else the announced rate, else the measured rate. size: size of the first picture; it
+    changes with the stream. waiting: as in LiveSource. Raise InputError if no first picture comes.
     """
 
     def __init__(

@@ -65,8 +65,8 @@ class Segmentation(NamedTuple):
 class Differences:
     """A batch of windows, before any tunable parameter acts.
 
-    least: the difference of each near pair, by `difference.kind`, in grey levels. both: where both neighbours are seen.
-    texture: of the reference, in 4 x grey levels a pixel. grey: its grey levels.
+    least: the difference of each near pair, by `difference.kind`, in grey levels. both: the pixels that both neighbours
+    show. texture: texture of the reference, in 4 x grey levels a pixel. grey: its grey levels.
 
     >>> least = torch.zeros(1, 2, 64, 64, dtype=torch.uint8)
     >>> least[..., 20:40, 20:40] = 90

@@ -19,7 +19,7 @@ class HOGDescriptor(nn.Module):
     """
 
     def __init__(self, layout: F.Layout | None = None) -> None:
-        """layout: of cells, blocks and window; by default OpenCV's."""
+        """layout: layout of cells, blocks and window; by default OpenCV's."""
         super().__init__()
         self.layout = layout or F.Layout()
 
@@ -42,7 +42,7 @@ class PersonScorer(nn.Module):
     def __init__(
         self, weights: Float[Tensor, " D"], bias: float, *, layout: F.Layout | None = None, window_stride_px: int = 8
     ) -> None:
-        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window.
+        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: step from window to window.
 
         Raise InputError for another number of weights.
         """

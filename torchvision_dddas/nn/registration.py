@@ -243,7 +243,7 @@ class FrameRegistration(nn.Module):
 
 
 class _FramePairs(NamedTuple):
-    """Pairs of frames. points: keypoints. valid: which of them exist. earlier, later: pyramids."""
+    """Pairs of frames. points: keypoints. valid: whether each keypoint exists. earlier, later: pyramids."""
 
     points: Tensor
     valid: Tensor

@@ -56,10 +56,10 @@ def choose_links(
     The bound from the prices shows that it has the largest sum in nearly all windows, but not always.
 
     value, tracks, now: scores, tracks and detections of the plausible links of this frame. The other arguments are
-    scores to the L detections of the next frame. onward: of the tracks after these links. born: of tracks that would
-    begin with each of the M detections. bridging: of tracks without a detection in this frame, which are the (i, k)
-    links that the source's eq. 4 and 5 leave out. Only links of this frame are returned, because the next frame decides
-    its own links with its own successor in view.
+    scores to the L detections of the next frame. onward: scores of the tracks after these links. born: scores of tracks
+    that would begin with each of the M detections. bridging: of tracks without a detection in this frame, which are the
+    (i, k) links that the source's eq. 4 and 5 leave out. Only links of this frame are returned, because the next frame
+    decides its own links with its own successor in view.
     """
     price = np.zeros(onward.shape[1])
     best, answer = -np.inf, np.zeros(len(value), bool)

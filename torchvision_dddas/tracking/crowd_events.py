@@ -58,7 +58,7 @@ class _Blob:
 
 @dataclass(frozen=True)
 class _Change:
-    """A possible join or split. host: the other crowd. frame, time_s, place_m: where and when it began."""
+    """A possible join or split. host: the other crowd. frame, time_s, place_m: when and where it began."""
 
     host: int
     frame: int

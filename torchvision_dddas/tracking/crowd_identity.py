@@ -70,8 +70,8 @@ class CrowdIdentities:
     ) -> Tracks:
         """Return the tracks of a frame with the identities of crowds, sorted by identity, without parts of crowds.
 
-        place_m, radius_m: of the N tracks with a detection, see `update`. A box that fills a gap gets the latest crowd
-        identity of its track.
+        place_m, radius_m: of the N tracks with a detection, as in `update`. A box that fills a gap gets the latest
+        crowd identity of its track.
         """
         seen = np.flatnonzero(tracks.row >= 0)
         identity = np.zeros(len(tracks), np.int64)

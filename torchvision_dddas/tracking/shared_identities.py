@@ -137,7 +137,7 @@ class _PairOfViews:
         motion_a: np.ndarray | None = None,
         motion_b: np.ndarray | None = None,
     ) -> None:
-        """Track the map to the last of some frames, or search for it. motion_a, motion_b: of the cameras."""
+        """Track the map to the last of some frames, or search for it. motion_a, motion_b: motion of each camera."""
         self._count += 1
         if self.follower is not None:
             if motion_a is not None or motion_b is not None:
@@ -328,7 +328,8 @@ def share_identities(
 ) -> Iterator[SharedFrame]:
     """Share the identities of tables, each of one view; every row needs an identity.
 
-    rates_hz: of each table; without rates, equal frame numbers are the same moment. All clips begin at the same time.
+    rates_hz: frame rate of each table; without rates, equal frame numbers are the same moment. All clips begin at the
+    same time.
     """
     tracker = MultiViewTracker(len(tables), delay_frames=delay_frames)
     fastest = max(rates_hz, default=1.0)

@@ -195,7 +195,8 @@ class DetectionTable(Table):
     `dddas detect` wrote the table, with moving targets only. ours: `dddas detect` or `dddas track` wrote it.
     label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
     kind: (N,) str, the kind of a row. `dddas track` writes detection, bridge (a box between two detections, where
-    nothing was seen) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
+    nothing was seen) or untracked (a detection without identity). None if not given. notes: notes on the reading of the
+    boxes.
 
     >>> box_px = np.tile([10.0, 20, 5, 9], (3, 1))
     >>> table = td.DetectionTable("boxes.csv", np.array([1, 1, 2]), box_px, np.ones(3), line=np.array([1, 2, 3]))

@@ -243,9 +243,9 @@ class Fix(Record):
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
     image_from_ground: (3, 3) from local metres to undistorted pixels (paper: distorted), if there is no pose.
     matrix_covariance: (8, 8) of its first eight elements (h33 = 1) in metres from about_m, the landmarks' centre, for
-    numerical precision. landmark: (n,) the landmarks that were seen. state: of each, used, reassigned or excluded.
+    numerical precision. landmark: (n,) the landmarks that were seen. state: used, reassigned or excluded, for each.
     chi2, freedom: consistency of the landmarks with the prediction; NaN and 0 without one.
-    changes: what was repaired or excluded, and why. cause: why there is no result, or only a weak one.
+    changes: repairs and exclusions, with their reasons. cause: why there is no result, or only a weak one.
 
     >>> td.Fix(5, "", cause="no landmark is seen")
     Fix(frame=5, cause='no landmark is seen')
@@ -396,7 +396,7 @@ class AerialLocations(Record):
 class FusedTargets(Table):
     """The targets that several platforms know together at one moment, one row per target.
 
-    time_s: by the common clock. frame: of the record that platform `by` measured then. target: (N,) int64.
+    time_s: time by the common clock. frame: of the record that platform `by` measured then. target: (N,) int64.
     state: (N, 4) east, north in local metres about origin_deg, and their velocities in m/s. covariance: (N, 4, 4).
     seen_by: (N,) dict, the platforms that saw the target within a second, each with its own number of the target.
     classes: names, "" for unknown. probability: (N, C) of each class.

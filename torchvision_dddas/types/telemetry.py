@@ -19,11 +19,10 @@ class Telemetry(Table):
     take-off point). above_sea_m: with height_zero "unknown", the log does not say whether it counts from the sea or
     from the take-off point. above_ellipsoid_m: above WGS 84. speed_m_s: over the ground.
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
-    heading_rad, pitch_rad, roll_rad: of the camera, as in Camera. If it looks straight down, the pitch is pi/2 and the
-    heading is the direction of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of
-    the vehicle's nose.
-    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m, position_sigma_m: standard deviations, the last for east and
-    for north; NaN: the values of the group `aerial`.
+    heading_rad, pitch_rad, roll_rad: angles of the camera, as in Camera. If it looks straight down, the pitch is pi/2
+    and the heading is the direction of the picture's upper edge. hfov_rad: horizontal field of view.
+    vehicle_heading_rad: heading of the vehicle's nose. heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m,
+    position_sigma_m: standard deviations, the last for east and for north; NaN: the values of the group `aerial`.
     heading_from: source of heading_rad in words, if the log does not contain the camera's heading; else empty.
     is_nominal: hfov_rad follows from a 35 mm equivalent focal length, and is measured along the pictures' longer side.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. start_local_s: the same by a clock of unknown zone.

@@ -19,7 +19,8 @@ class AppearanceUse(Record):
     """Whether the association of a frame used the appearance of targets, and the reason.
 
     weight: of the locations in the source's association; NaN in the default association, which adds appearance to
-    scores. location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN if not computed.
+    scores. location_dispersion, appearance_dispersion: dispersions of the source's rule, in [0, 1]; NaN if not
+    computed.
 
     >>> td.AppearanceUse(looked=True, cause="two boxes overlap")
     AppearanceUse(looked=True, cause='two boxes overlap')

@@ -47,7 +47,7 @@ class Command(Record):
 
 @dataclass(frozen=True)
 class GroundPicture(Record):
-    """A picture of a ground vehicle at a frame of the aerial camera. camera: with the reported pose at that moment.
+    """A picture of a ground vehicle at a frame of the aerial camera. camera: its reported pose at that moment.
 
     >>> camera = td.Camera("ugv1", (640, 480), (500.0, 500.0), (319.5, 239.5))
     >>> types.GroundPicture("ugv1", 12, np.zeros((480, 640, 3), np.uint8), camera)
@@ -94,7 +94,7 @@ class Truth(Record):
     """Ground truth of a simulated frame.
 
     mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all in the world.
-    pose: of the camera at mid-exposure. events: faults, joins and splits of crowds, in words.
+    pose: pose of the camera at mid-exposure. events: faults, joins and splits of crowds, in words.
 
     >>> none, pair, triple = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
     >>> nobody = types.Bodies(none, none, none, triple, pair, none, none, none, triple, triple, none)

@@ -35,14 +35,14 @@ def _unknown() -> np.ndarray:
 class ZoneEvent(Record):
     """An event of a target at a zone, or of a crowd with other crowds. Unknown values are NaN, unknown texts empty.
 
-    kind: enter, leave, present (inside when first seen), dwell, or cross (a line). direction: of a crossing, to_right
-    or to_left of the line as it runs. frame, time_s: of the event. The moment when the target passed the border is
-    interpolated between two frames; `frame` is the later frame. east_north_m, lonlat_deg, image_px: (2,) the target's
-    place at that moment. speed_m_s, or speed_px_s at a zone in pixels. inside_s: time that it has been inside (leave,
-    dwell). is_first: whether the target has not been counted at this zone before.
-    others: the crowds that join the target or split off it. The kinds of these events are join, split, gather and
-    scatter. Their zone is empty; frame, time_s and the place state where the other crowd was last (join) or first
-    (split) seen alone.
+    kind: enter, leave, present (inside when first seen), dwell, or cross (a line). direction: to_right or to_left of
+    the line in its direction, for a crossing. frame, time_s: frame and time of the event. The moment when the target
+    passed the border is interpolated between two frames; `frame` is the later frame. east_north_m, lonlat_deg,
+    image_px: (2,) the target's place at that moment. speed_m_s, or speed_px_s at a zone in pixels. inside_s: time that
+    it has been inside (leave, dwell). is_first: whether the target has not been counted at this zone before. others:
+    the crowds that join the target or split off it. The kinds of these events are join, split, gather and scatter.
+    Their zone is empty; frame, time_s and the place state where the other crowd was last (join) or first (split) seen
+    alone.
 
     >>> td.ZoneEvent("enter", "door", target=7, frame=12, time_s=1.2, speed_m_s=1.4).describe()
     'target 7 enters door at 1.4 m/s'

@@ -110,7 +110,7 @@ class AdjustmentList:
     """
 
     def __init__(self, most: int = 1000) -> None:
-        """most: how many adjustments of a parameter are listed; the others are only counted."""
+        """most: largest number of listed adjustments of a parameter; further adjustments are only counted."""
         self.rows: list[dict[str, Any]] = []
         self.made: Counter[str] = Counter()
         self._most = most

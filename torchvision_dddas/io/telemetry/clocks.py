@@ -242,8 +242,8 @@ def settle_times(
     """Return seconds since the first time, (N,), NaN if missing; that time since 1970; and the columns used.
 
     Seconds come from the finest times that do not run back, the clock from dates. step_m: distance of the vehicle
-    between rows. is_far: (N,) whether it jumps before the row, as between flights. zone: for dates without one. Raise
-    InputError if the unit of all times is unknown.
+    between rows. is_far: (N,) whether it jumps before the row, as between flights. zone: time zone of dates that have
+    no zone. Raise InputError if the unit of all times is unknown.
     """
     day = next((one for one in columns if one.kind == "day"), None)
     whole = [one for one in columns if one.kind != "day"]

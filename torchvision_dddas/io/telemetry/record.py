@@ -94,7 +94,7 @@ class Log:
     def latitude_first(self, pairs: np.ndarray, told: str, asked: str, what: str) -> bool:
         """Return whether the latitude is the first of two coordinates, (N, 2). Raise InputError if unknown.
 
-        told, asked: the order according to the dialect and to the user. what: the field that holds them, in words.
+        told: the order in the dialect. asked: the order that the user set. what: the field with the pair, in words.
         """
         is_beyond = (np.abs(pairs) > 90).any(axis=0)
         if asked == "auto" and is_beyond[0] != is_beyond[1]:

@@ -111,7 +111,7 @@ def _is_result(place: Path) -> bool:
 
 @dataclass(frozen=True)
 class Result:
-    """A result. frames: number of the run's last frame, 0 if unknown. state: of the run.
+    """A result. frames: number of the run's last frame, 0 if unknown. state: state of the run.
 
     place: the folder or file. detected: (N, 4) boxes of each frame with targets; None if only tracks were written.
     tracks: the boxes with identities; None if there are none. notes: how a file was read.

@@ -37,9 +37,9 @@ def run_scenario(
 ) -> tuple[RunRecord, CrowdScore]:
     """Fly a scenario, write all files into a folder, and return the record of the run and its score.
 
-    zones: zones whose events are also written. overrides: of the settings. scene: of the scenario. progress: takes a
-    name and the number of frames, and returns a context with a function to call for each frame. Raise InputError for
-    bad input.
+    zones: zones whose events are also written. overrides: changes of the settings. scene: changes of the scenario.
+    progress: takes a name and the number of frames, and returns a context with a function to call for each frame. Raise
+    InputError for bad input.
     """
     with SimulatedRunRecorder(folder, save) as output:
         chosen = load_scenario(scenario, scene, seed)

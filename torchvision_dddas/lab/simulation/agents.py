@@ -46,7 +46,7 @@ class Moment:
     along and about east, north, up. flight: the UAV's own report, in longitude and latitude; None while it is silent.
     reports: the ground vehicles' reports since the last frame. heading_rad: (K,) true headings of their cameras.
     reported_lonlat_deg: (K, 2), NaN while silent. reported_heading_rad: (K,). The vehicles' true places are those of
-    the bodies of kind ugv, in the same order. picture: "", "frozen" or "dropped". events: in words.
+    the bodies of kind ugv, in the same order. picture: "", "frozen" or "dropped". events: descriptions of events.
     """
 
     number: int

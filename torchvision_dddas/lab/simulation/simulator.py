@@ -60,7 +60,8 @@ class Shot:
 class Simulator:
     """A run of a scenario from its first frame. The scenario, its seed and the commands determine it completely.
 
-    camera: the aerial camera. colours: of the landmarks. names: of the ground vehicles. frames: number of frames.
+    camera: the aerial camera. colours: colours of the landmarks. names: names of the ground vehicles. frames: number of
+    frames.
     """
 
     def __init__(self, scenario: Scenario, elevation: Elevation | None = None, photo: Ortho | None = None) -> None:

@@ -68,8 +68,8 @@ class Plan:
 class DescentStep:
     """The parameters and losses after a step; step 0 is the start.
 
-    loss: of the step's batch, NaN at step 0. watched: mean loss of the watched examples at the final softness; None if
-    they were not measured.
+    loss: loss of the step's batch, NaN at step 0. watched: mean loss of the watched examples at the final softness;
+    None if they were not measured.
     """
 
     step: int

@@ -45,8 +45,8 @@ class Family(ABC):
     """A stage of the pipeline whose parameters can be tuned: labelled examples, and a loss on them.
 
     name: a key of FAMILIES. task: the study's task, whose clips are used. measure: compared before and after, such as
-    motion.pixels.f. softness: of the loss at the first and at the last step. interval: frames between examples. empty:
-    reason why a clip may give no example; if it is set, a clip without examples is an error.
+    motion.pixels.f. softness: softness of the loss at the first and at the last step. interval: frames between
+    examples. empty: reason why a clip may give no example; if it is set, a clip without examples is an error.
     """
 
     name: str
@@ -133,10 +133,10 @@ def prepare(
 ) -> Prepared:
     """Read a study's clips and prepare the examples of the clips that are not held out.
 
-    names: of parameters, as for `expand_names`. holdout, clips: patterns of clip names. measure: replaces the family's
-    measure. tick: called once for each example. Raise InputError for a parameter that cannot be tuned or has no effect
-    under the settings, for parameters of several families, for clips without the needed truth, and as `plan_study`
-    does.
+    names: names of parameters, as for `expand_names`. holdout, clips: patterns of clip names. measure: replaces the
+    family's measure. tick: called once for each example. Raise InputError for a parameter that cannot be tuned or has
+    no effect under the settings, for parameters of several families, for clips without the needed truth, and as
+    `plan_study` does.
     """
     settings = load_config(spec.config, spec.overrides)
     by_family: dict[str, list[str]] = {}

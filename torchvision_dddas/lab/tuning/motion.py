@@ -199,7 +199,7 @@ def _label_picture(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
 
 
 class _RecordingEngine(OpenCVEngine):
-    """An engine that keeps the windows of wanted frames. number: of the frame that is being prepared."""
+    """An engine that keeps the windows of wanted frames. number: number of the frame that is being prepared."""
 
     def __init__(self, settings: Settings, wanted: Set[int]) -> None:
         super().__init__(settings)

@@ -22,7 +22,7 @@ class Tunable:
     """One parameter that gradients can move between the limits of its field in `Settings`.
 
     log: steps multiply the value plus offset; otherwise they add to the value. The offset makes 0 reachable. rounding:
-    of the final value; during the descent the parameter is continuous.
+    rounding of the final value; during the descent the parameter is continuous.
     """
 
     name: str

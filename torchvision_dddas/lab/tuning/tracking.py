@@ -116,9 +116,9 @@ class Stretches:
 
     time, step, density, missing, turnover: as in `SceneState`. size: width and height of the picture. box_px: x, y,
     width, height; any numbers if the target is absent. there: whether a target is seen. certain: whether its score is
-    1. begins: whether its score allows a new track. motion: homographies from the previous frame. likeness: of tracks
-    (rows) and boxes, NaN if unknown. visible: visible shares of the boxes. own: whether the boxes are moving targets
-    that `dddas detect` found.
+    1. begins: whether its score allows a new track. motion: homographies from the previous frame. likeness: similarity
+    of tracks (rows) and boxes, NaN if unknown. visible: visible shares of the boxes. own: whether the boxes are moving
+    targets that `dddas detect` found.
     """
 
     time: Float[Tensor, "B T"]

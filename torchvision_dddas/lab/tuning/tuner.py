@@ -49,7 +49,7 @@ class Display:
 class Tuned:
     """The result of a run. before, after: values of the tuned parameters.
 
-    failed: in one line, why the run stopped early; empty if it did not stop early.
+    failed: the cause of an early stop in one line; empty without an early stop.
     """
 
     descended: Descended
@@ -76,7 +76,7 @@ class Tuner:
         cache: Path | None = None,
         display: Display | None = None,
     ) -> None:
-        """resume: continue from the folder's checkpoint if there is one. device: where the descent is computed.
+        """resume: continue from the folder's checkpoint if there is one. device: the device that computes the descent.
 
         jobs, cache: as for `judge`.
         """

@@ -107,7 +107,7 @@ def judge(
 
 
 def _compare(goal: Goal, cases: Sequence[Sequence[Case]], clips: tuple[str, ...]) -> Side:
-    """Compare the goal before and after. cases: of these clips, before and after."""
+    """Compare the goal before and after. cases: results of these clips, before and after."""
     notes = {
         f"{case.clip.name}, {when}: {case.cause}"
         for when, found in zip(TIMES, cases, strict=True)

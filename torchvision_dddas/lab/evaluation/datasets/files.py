@@ -86,7 +86,7 @@ def frames_by_number(pictures: Iterable[Path]) -> dict[int, int]:
 
 
 def masks_by_frame(masks: Iterable[Path], frames: Mapping[int, int], place: Path) -> dict[int, Path]:
-    """Return the masks by frame. frames: from `frames_by_number`. place: of the pictures, for messages.
+    """Return the masks by frame. frames: from `frames_by_number`. place: place of the pictures, for messages.
 
     Raise InputError for a mask whose number no picture has, and for two masks of one number.
     """

@@ -79,7 +79,7 @@ _EXPECTED = {
 class Reader:
     """A reader of data sets of one kind. A subclass describes its layout on disk; docs/datasets.md states what counts.
 
-    layout: in one line. terms: conditions of use. defaults: of the options. The type of a default is the option's type;
+    layout: in one line. terms: conditions of use. defaults: default of each option, which also sets the option's type;
     a list holds texts, and None stands for an optional number above 0. words: for each option that lists words, its
     data set's name and the known words; the default is all of them. missing, notes: see Dataset.
     """

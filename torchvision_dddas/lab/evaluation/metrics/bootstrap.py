@@ -159,11 +159,11 @@ class Effect(NamedTuple):
 def effects(
     statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES, most: int = EXCHANGES
 ) -> dict[str, Effect]:
-    """Return the effect on each measure. strata: of one result's units, whose blocks are drawn or exchanged together.
+    """Return the effect on each measure. strata: groups of one result's units, in which blocks are drawn together.
 
-    statistic: of weights (2 U,): how often each unit of the first result counts, then of the second. resamples: number
-    of samples for the interval. most: largest number of ways to exchange the results; if there are fewer, all are
-    tried.
+    statistic: function of weights (2 U,), which state how often each unit of the first and then of the second result
+    counts. resamples: number of samples for the interval. most: largest number of ways to exchange the results; if
+    there are fewer, all are tried.
     """
     units = sum(stratum.units for stratum in strata)
     ones, none = np.ones(units), np.zeros(units)

@@ -30,7 +30,7 @@ class FramePair(NamedTuple):
 class Paired(NamedTuple):
     """The frames of a clip with any box, in order, and the number of boxes of each true and each found identity.
 
-    numbers: of the frames.
+    numbers: numbers of the frames.
     """
 
     numbers: np.ndarray

@@ -96,8 +96,8 @@ METRICS: Mapping[str, Metric] = {
 class MetricGroup(NamedTuple):
     """Measures that come from the same counts.
 
-    title: in reports. tasks: the tasks of a study that can have the group. columns: the measures of its table on the
-    terminal. shown: the measures of its table in reports. compared: the measures that a comparison of two studies
+    title: name in reports. tasks: the tasks of a study that can have the group. columns: the measures of its table on
+    the terminal. shown: the measures of its table in reports. compared: the measures that a comparison of two studies
     tests; the first is also compared clip by clip. counts: its counts, all zero. measures: function from counts to
     measures by name. Both are None if the measures come from samples that are pooled, `boxes.Ranking` and
     `metres.measures`.

@@ -88,10 +88,10 @@ class ClipTruth:
     """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
 
     tracks: the boxes with their identities; None if the truth has none. ignored: boxes that do not count. length:
-    frames of the clip, 0 if unknown. labels: of the masks. positions: None if unknown. fleet: positions of the
-    landmarks, with their own identities. `matching.counted` uses ignoring, others and regions. ignoring: the treatment
-    of a found box on an ignored box. others: boxes that are neither true nor ignored but may match a found box.
-    regions: unlabelled regions, whose identities have no meaning.
+    frames of the clip, 0 if unknown. labels: meaning of the masks' values. positions: None if unknown. fleet: positions
+    of the landmarks, with their own identities. `matching.counted` uses ignoring, others and regions. ignoring: the
+    treatment of a found box on an ignored box. others: boxes that are neither true nor ignored but may match a found
+    box. regions: unlabelled regions, whose identities have no meaning.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -229,7 +229,7 @@ def read_rows(path: Path, what: str) -> MotRows:
 
 
 def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
-    """Raise InputError with the line if a box has no size. line: (N,) line in the file. name: of the file."""
+    """Raise InputError with the line if a box has no size. line: (N,) line in the file. name: name of the file."""
     if (flat := ~(box_px[:, 2:] > 0).all(axis=1)).any():
         i = int(flat.argmax())
         size = f"{box_px[i, 2]:g}×{box_px[i, 3]:g}"

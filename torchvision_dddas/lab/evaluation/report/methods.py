@@ -26,7 +26,7 @@ Methods = Mapping[str, Mapping[str, Any]]
 
 
 def save_methods(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write report.html, tables/ and figures/. content: of comparison.json, with None for NaN."""
+    """Write report.html, tables/ and figures/. content: content of comparison.json, with None for NaN."""
     methods = content["methods"]
     tables: dict[str, Table] = {}
     tasks: list[dict[str, Any]] = []

@@ -35,7 +35,7 @@ Groups = Mapping[str, Any]
 
 
 def study_report(metrics: Mapping[str, Any], results: Results) -> str:
-    """Return the HTML. metrics: from `summarize`, with None for NaN. Pictures are read from the clips' files."""
+    """Return the HTML. metrics: result of `summarize`, with None for NaN. Pictures are read from the clips' files."""
     by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
     tasks = [_task(task, metrics["tasks"].get(task, {}), cases) for task, cases in by_task.items() if cases]
     n_clips = len({str(case.clip.place) + case.clip.name for case in results.cases if case.scored is not None})
@@ -84,7 +84,7 @@ def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict
 
 
 def figure_of(groups: Groups, group: str, measure: str, name: str = "") -> Interval:
-    """Return a measure with its interval, NaN if unknown. name: of the clip or set that it belongs to."""
+    """Return a measure with its interval, NaN if unknown. name: name of the clip or set that it belongs to."""
     low, high = groups.get("intervals", {}).get(group, {}).get(measure) or (None, None)
     value, low, high = (
         math.nan if number is None else float(number) for number in (groups.get(group, {}).get(measure), low, high)

@@ -24,7 +24,7 @@ _MOST_ERRORS = 500
 class Tally(NamedTuple):
     """Numbers for each frame (F,): right, false, missed, changed identities, and other right pixels.
 
-    unit: of the numbers. measure: name of 2 right / (2 right + false + missed).
+    unit: unit of the numbers. measure: name of 2 right / (2 right + false + missed).
     """
 
     right: np.ndarray

@@ -85,7 +85,7 @@ def start_local(jobs: int, deaths: int, silent_s: float, stack: ExitStack) -> Cl
 def kill_local(client: Any) -> None:
     """End the processes of this machine at once. Finished results are in the cache; Dask would wait for the others.
 
-    client: of `start_local`; None if a signal came while the processes started. Dask's messages are not shown.
+    client: result of `start_local`; None if a signal came while the processes started. Dask's messages are not shown.
     """
     for name in ("asyncio", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -118,7 +118,7 @@ def _text(table: Mapping[str, Any], key: str, where: str, default: Any) -> Any:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """The plan of a study. left_out: clips and tasks left out. notes: other missing data. facts: of the data sets."""
+    """The plan of a study. left_out: clips and tasks left out. notes: other missing data. facts: on the data sets."""
 
     settings: Settings
     jobs: tuple[Job, ...]

@@ -27,7 +27,7 @@ _NOBODY, _NOT_ASKED = -1, -2
 
 
 def score(clip: Clip, task: Task, found: Findings, interval: int = 1) -> Scored:
-    """Score one case. interval: of tracking and association, as `dddas evaluate --interval`.
+    """Score one case. interval: interval of tracking and association, as `dddas evaluate --interval`.
 
     Boxes that count neither as right nor as false (see `matching.counted`) are left out. Raise InputError if
     the truth is missing, or does not fit the findings.
@@ -85,7 +85,7 @@ def by_task(clip: ClipScore, interval: int = 1) -> dict[Task, Scored]:
 
 
 def _spread(clip: ClipScore, interval: int) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
-    """Return the scored frames (F,) and their counts (F,), by group and name. interval: of tracks; 0 for boxes, masks.
+    """Return the scored frames (F,) and their counts (F,), by group and name. interval: of tracks, 0 for boxes and masks.
 
     Tracks are also scored on frames without boxes. Such frames have counts of 0, which is a result.
     """

@@ -152,7 +152,7 @@ def sum_costs(cases: Sequence[Case]) -> dict[str, Any]:
 class Estimate(NamedTuple):
     """Measures of a group as a function of how often each unit counts, for resampling.
 
-    seed: of the resampling; it depends only on the group and the content.
+    seed: seed of the resampling, which depends only on the group and the content.
     """
 
     statistic: Statistic

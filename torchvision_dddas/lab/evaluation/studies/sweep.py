@@ -43,7 +43,7 @@ Measure = Callable[[Mapping[str, object]], Measured]
 class ParameterAxis:
     """A parameter and its values; without values the range from low to high, both included.
 
-    step: of whole numbers; 0: continuous. log: sample on a logarithmic scale.
+    step: step of whole numbers; 0: continuous. log: sample on a logarithmic scale.
     """
 
     parameter: str
@@ -329,7 +329,7 @@ def split_clips(
 class SweepRecord:
     """The results of a sweep so far: sweep.json after every trial; best.toml and the report at the end.
 
-    tuned, held: names of clips. notes: of `parameter_notes`.
+    tuned, held: names of clips. notes: result of `parameter_notes`.
     on_held: the measure on held-out clips, with the original and with the best settings.
     """
 
