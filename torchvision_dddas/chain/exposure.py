@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-# The quantiles of the grey levels that are compared. Camera motion changes them little, and not as a gain does.
+# The quantiles of the grey levels that are compared. Camera motion changes them little, and unlike a gain.
 _SHARES = np.linspace(0.02, 0.98, 33)
 _EDGES = np.arange(257) - 0.5  # edges of the histogram's bins
 # Quantiles nearer to black or white than this may be clipped, and are not used.

@@ -169,7 +169,7 @@ def parse_override(text: str) -> tuple[str, object]:
         try:
             return name, float(value)  # TOML accepts 0.3 but not .3
         except ValueError:
-            return name, value  # a bare word, for a choice such as affine
+            return name, value  # a word without quotes, for a choice such as affine
 
 
 def nearest(name: str, known: list[str], where: str = "`dddas settings` lists them all") -> str:

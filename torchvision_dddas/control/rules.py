@@ -130,7 +130,7 @@ def shed(
     if shares[at] > parameters.load or slow:
         far = shares[at] > _FAR_OVER * parameters.load
         to = max(at, cheapest) if far else min(at + 1, last)
-        # The effect of skipping pictures is known, so apply as many levels as needed. That of cheaper frames is not.
+        # Only the effect of skipping pictures is known, so only then apply as many levels as needed at once.
         while (far or at >= cheapest) and shares[to] > parameters.load and to < last:
             to += 1
         undone = now_s - now.eased_s < 2 * now.patience * parameters.calm_s

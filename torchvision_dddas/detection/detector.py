@@ -155,7 +155,7 @@ class MotionDetector:
         self._controller = IntervalController(self.settings, rate_hz, telemetry)
         self._buffer = FrameBuffer()
         self._memory = _memory_frames(self.settings, telemetry is not None)
-        # Frames below these indices are registered, are observed, have targets, are in the history, were returned.
+        # Frames below each index are registered, observed, have targets, are in the history, or were returned.
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
         self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest frame that came
         self._returned = self._last  # the frame of the latest scene that was returned

@@ -15,10 +15,10 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.runtime import open_session
 from torchvision_dddas.types import Detections, Frame, as_picture
 
-_GREY = 114  # beside the picture, as YOLOs are trained
+_GREY = 114  # grey level around the picture, as in the training of YOLO
 _USUAL_PX, _STRIDE = 640, 32  # default size of an input with free sides
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_MOST_BOXES = 1000  # of a frame, the likeliest
+_MOST_BOXES = 1000  # keep at most this number of boxes a frame, the likeliest
 
 
 class OnnxDetector:

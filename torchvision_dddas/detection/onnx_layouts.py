@@ -15,7 +15,7 @@ Size = tuple[int, int]
 _STRIDES = ((8, 16, 32), (4, 8, 16, 32), (8, 16, 32, 64), (16, 32))
 """The grids of a YOLO: the usual ones, with P2, with P6, and of the tiny models."""
 
-# Of ImageNet.
+# Mean and standard deviation of ImageNet's channels.
 _MEAN, _SPREAD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 
 # Raw outputs of YOLOX, in cells and logarithms, are smaller than this; boxes in pixels reach over the picture.

@@ -11,7 +11,7 @@ from torchvision_dddas.functional.soft import step
 
 TURN = 180.0  # one turn of the hue
 FULL = 255.0  # largest saturation and value
-BINS = 256  # in the histogram of a channel
+BINS = 256  # number of bins in the histogram of a channel
 
 
 def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:

@@ -21,8 +21,8 @@ ARC = tuple(
 )
 TINY = 2.220446049250313e-16  # OpenCV adds this to the divisor
 
-# L2-Hys: added to the norm before the clip, for each number of a block; and added after it (modules/objdetect,
-# hog.cpp).
+# L2-Hys: SOFT_FIRST for each number of a block is added to the norm before the clip, and SOFT_SECOND after it
+# (modules/objdetect, hog.cpp).
 SOFT_FIRST, SOFT_SECOND = 0.1, 1e-3
 
 

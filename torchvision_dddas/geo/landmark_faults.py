@@ -131,7 +131,7 @@ def try_repairs(
     best: tuple[float, PoseSolution, np.ndarray, np.ndarray] | None = None
     for order, used in hypotheses:
         if not expected.known[:6].any() and used.sum() < min(_ENOUGH_ALONE, len(marks) - 1):
-            continue  # among six landmarks with wrong names, some four fit a wrong pose
+            continue  # of six landmarks with wrong names, some group of four fits a wrong pose
         solution = find_pose(reorder_pixels(marks, order), camera, expected, used)
         if solution is not None and solution.freedom > 0 and passes(solution, probability):
             chance = _chance_above(solution.freedom, solution.cost)

@@ -68,7 +68,7 @@ REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
 SCHEMA = Schema(
     "detections",
     replace(FRAME, low=0, wanted=f"a whole number from 1 to {LAST_FRAME}, or from 0 throughout"),
-    *(replace(column, low=-FARTHEST) for column in BOX),  # numbers of any order
+    *(replace(column, low=-FARTHEST) for column in BOX),  # the numbers may be in another order, such as corners
     Column("score", ".6g", may_be_empty=True),
     Column("identity"),
     Column("class_id", "d", -1, 2**53, is_whole=True, may_be_empty=True),

@@ -185,7 +185,7 @@ class StatusWriter:
         self._say, self._show = say, show
         self.state = "running"
         self._known, self._waiting = 0, list[Event]()
-        self._failing = dict[str, str]()  # by file
+        self._failing = dict[str, str]()  # error text by file
         self._measured_s, self._results = time.monotonic(), 0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="status", daemon=True)

@@ -99,7 +99,7 @@ class LiveTeam:
         self._looks: dict[str, deque[PlatformLook]] = {name: deque(maxlen=_KEPT) for name in self._healths}
         self._notes: list[str] | None = None
         self._is_fusing = False
-        self._refused, self._now_s = False, -math.inf  # by the disk; time of the newest main result
+        self._refused, self._now_s = False, -math.inf  # whether the disk refused; time of the newest main result
         self._inbox, self._fused = deque[PlatformLook](), deque[FusedTargets]()
         self._left_out, self._facts = Counter[str](), self._team.facts
         self._open: list[LiveSource] = []

@@ -18,7 +18,7 @@ Topics = dict[str, dict[str, Topic]]
 _E7, _DEGREES = "longitude_deg=lon/1e7 latitude_deg=lat/1e7 ", "longitude_deg=lon/1 latitude_deg=lat/1 "
 _ARDUPILOT = "longitude_deg=Lng/1 latitude_deg=Lat/1 above_sea_m=Alt/1 altitude_m=RelHomeAlt/1 altitude_m=RelAlt/1"
 _RECEIVER = f"{_E7} above_sea_m=alt/1e3 above_ellipsoid_m=alt_ellipsoid/1e3 speed_m_s=vel/1e2 speed_m_s=vel_m_s/1"
-_ACCURACY = "accuracy_m=eph/1"  # of PX4's receivers; PX4's estimates treat slow errors as noise
+_ACCURACY = "accuracy_m=eph/1"  # PX4's receivers give it; PX4's estimates treat slow errors as noise
 _SINCE_PX4_1_14 = "above_sea_m=altitude_msl_m/1 above_ellipsoid_m=altitude_ellipsoid_m/1 speed_m_s=vel_m_s/1"
 # Message -> quantity=field/N for each quantity, where N units of the field are 1 unit of the quantity. The best come
 # first: estimates of the autopilot, receivers (the receiver with most fixes is used), others with a height or speed.

@@ -103,7 +103,7 @@ def _whole_sentences(log: Log, text: str, faults: list[tuple[int, str]]) -> Iter
         digits = checksum[1:].upper()
         if len(digits) == 2 and int(digits, 16) not in (right, right ^ apart, given):
             faults.append((number, "with a wrong checksum"))
-        # A line that was cut off lacks its checksum. So do all sentences of some receivers.
+        # A line that was cut off lacks its checksum. Some receivers never write checksums.
         elif not checksum and bare[body[:5]] <= names[body[:5]] / 2:
             faults.append((number, "without a checksum"))
         elif checksum and len(digits) < 2 and digits not in ("", f"{right:X}", f"{right:02X}"[0]):

@@ -13,7 +13,7 @@ from torchvision_dddas.io.telemetry.autopilots import NAMES, Topic, Topics, add_
 from torchvision_dddas.io.telemetry.record import Log
 from torchvision_dddas.types import Telemetry
 
-PX4_RADIUS_M = 6_371_000.0  # of the Earth in PX4's MapProjection (CONSTANTS_RADIUS_OF_EARTH)
+PX4_RADIUS_M = 6_371_000.0  # radius of the Earth in PX4's MapProjection (CONSTANTS_RADIUS_OF_EARTH)
 MAGIC = b"ULog\x01\x12\x35"
 
 

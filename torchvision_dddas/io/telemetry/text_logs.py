@@ -75,7 +75,7 @@ def read_subtitles(
     lacking: dict[str, list[int]] = {}
     timeless: list[int] = []
     lenses: list[dict[str, str]] = []
-    last_s = last_date_s = math.nan  # of the previous subtitle
+    last_s = last_date_s = math.nan  # time and date of the previous subtitle
     last: Values = {}
     jumps, shift_s = list[tuple[float, float]](), 0.0
     for (line, time_s, _), (tuples, rest), date in zip(subtitles, parted, dates, strict=True):

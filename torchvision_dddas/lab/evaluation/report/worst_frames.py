@@ -31,7 +31,7 @@ TRUE: Colour = (66, 228, 240)
 UNSCORED: Colour = (150, 150, 150)
 _GREY = 70  # grey level that replaces a missing picture
 _MAX_OF_A_CLIP = 3
-_SMALL, _RING = 4, 6  # px on the page
+_SMALL, _RING = 4, 6  # areas with shorter sides get a ring of this radius, px on the page
 
 Size = tuple[int, int]
 
