@@ -97,7 +97,7 @@ class Instrument(Protocol):
 
 
 class StartedSource:
-    """A source whose first frame has been read, so that its vehicles have reported. All else is the source's own."""
+    """A source whose first frame has been read, so that its vehicles have reported. All else is as in the source."""
 
     def __init__(self, source: Instrument) -> None:
         self._source, self._frames = source, iter(source)

@@ -175,7 +175,7 @@ class Beliefs:
 
 
 def evidence(seen: GroundObservation, parameters: ConfirmParameters) -> Float[np.ndarray, "N"]:
-    """Return (N,) what an observation adds to the log-odds; 0 without a look.
+    """Return (N,) the amount that an observation adds to the log-odds; 0 without a look.
 
     d and f are the detection and false-alarm rates. Without a person the value is ln (1 - d)/(1 - f). With a person it
     is the log-odds of the person's probability, at most ln d/f, because a probability of 1 is not a proof. In a blob

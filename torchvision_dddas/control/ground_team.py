@@ -128,7 +128,7 @@ class GroundTeam:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Of each platform, for run.json: frames, located people, how many of them others saw too, and weight."""
+        """Facts on each platform for run.json: frames, located people, people that other platforms saw too, weight."""
         weights, offsets = self.fusion.weights, self.fusion.offsets_m
         return {
             name: {
@@ -198,7 +198,7 @@ class GroundTeam:
         return known
 
     def confirm(self, looks: Iterable[PlatformLook], located: AerialLocations) -> Confirmation:
-        """Return what the views of ground platforms around this time say of the main clip's targets."""
+        """Return the confirmation of the main clip's targets by the ground platforms' views around this time."""
         seen = [(look.name, self._observe(look, located)) for look in looks if look.view is not None]
         names = located.positions.target.tolist()
         self._beliefs.add(names, seen)
@@ -224,7 +224,7 @@ class GroundTeam:
                 self.notes.append(f"{name} is {off:.1f} m off where the others agree: its weight is {weight:.2f}")
 
     def _unmatched(self, name: str) -> str:
-        """Why a platform that locates targets may share none with another."""
+        """Return the possible reasons why no other platform sees the targets that a platform locates."""
         if name in self.further:
             return (
                 f"{name} locates targets, and none of them was found to be one that another platform sees. That takes "

@@ -104,7 +104,7 @@ class UgvTeam:
         return np.array([vehicle.place_m for vehicle in self._known.values()]).reshape(-1, 2)
 
     def orders(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None) -> tuple[Order, ...]:
-        """Return orders for all vehicles that are not silent; none without targets. rows: the targets to follow."""
+        """Return orders for all vehicles that are not silent; [] without targets. rows: the targets to follow."""
         if not len(rows) or not self._known:
             self._ring = None
             return ()

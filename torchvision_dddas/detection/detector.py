@@ -176,10 +176,10 @@ class MotionDetector:
 
     @property
     def delay_frames(self) -> int:
-        """How many frames after its own frame a scene is returned at the interval in force, at most two intervals.
+        """Delay in frames from a frame to the return of its scene, at the current interval: at most two intervals.
 
-        Batches of several windows make scenes wait for whole batches; the value is the longest wait then. Repeated
-        pictures come on top of it.
+        Batches of several windows make scenes wait for whole batches. The value is then the longest wait. Repeated
+        pictures add to it.
         """
         used = self._controller.distance.settings
         batches = math.ceil((look_ahead(self.interval, used) - 1) / self.batch) + 1

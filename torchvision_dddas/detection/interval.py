@@ -96,7 +96,7 @@ def look_ahead(interval: int, settings: Settings) -> int:
 def settling_delay(interval: int, settings: Settings) -> int:
     """Return how many later frames must be observed before a frame is settled.
 
-    It is 0 without tracklets and small targets. Else it is two, or more so that it and `look_ahead` are two intervals.
+    It is 0 without tracklets and small targets. Else it is at least two, and two intervals minus `look_ahead`.
     """
     if uses_tracklets(settings) or settings.small.on:
         return max(2, 2 * interval - look_ahead(interval, settings))

@@ -13,7 +13,7 @@ Size = tuple[int, int]
 """(width, height) of the network's input, px."""
 
 _STRIDES = ((8, 16, 32), (4, 8, 16, 32), (8, 16, 32, 64), (16, 32))
-"""The grids of a YOLO: the usual ones, with P2, with P6, and of the tiny models."""
+"""Strides of the grids of YOLO networks: usual networks, networks with P2, networks with P6, tiny networks."""
 
 # Mean and standard deviation of ImageNet's channels.
 _MEAN, _SPREAD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)

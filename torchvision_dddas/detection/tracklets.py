@@ -178,7 +178,7 @@ class _Line:
     """Lines of constant velocity through the centres of tracklets, fitted by least squares as centres are added."""
 
     def __init__(self, centre: np.ndarray, velocity: np.ndarray, spread: np.ndarray, over: np.ndarray) -> None:
-        """Start M lines. spread: (M, 2) of a centre, px. over: (M,) looks over which the velocity was measured."""
+        """Start M lines. spread: (M, 2) sigma of a centre, px. over: (M,) looks that the velocity spans."""
         self.centre, self.velocity, self.spread = centre, velocity, spread
         self.offset_px = np.zeros_like(centre)  # offset of the line at time 0 from the candidate's own centre
         self._of_velocity = 1.4 * spread / over[:, None]

@@ -72,8 +72,8 @@ def rgb_histogram(
     softness: at 0 each pixel counts in the nearest level, which is exact for 8-bit pictures. At 1 it is shared between
     the two nearest levels by distance. In between, softness is the width of the ramp from one level to the next.
     normalize: let each channel add up to 1; False returns counts, 300 in all for a box of 100 pixels.
-    largest: (height, width) in pixels that no box exceeds. Only so many pixels are then read for each box, and a larger
-    box is not valid. None: the whole picture is read for each box.
+    largest: (height, width) in pixels that no box exceeds. At most this number of pixels is then read for each box, and
+    a larger box is not valid. None: the whole picture is read for each box.
 
     >>> box_px, valid = torch.tensor([[[1.0, 1, 4, 4]]]), torch.ones(1, 1, dtype=torch.bool)
     >>> histogram, there = F.rgb_histogram(torch.zeros(1, 3, 8, 8), box_px, valid)

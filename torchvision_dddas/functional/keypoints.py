@@ -62,8 +62,9 @@ def grid_features(
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
     """Return the best pixel of every cell of cell_px x cell_px, row by row, its score, and whether it is valid.
 
-    They are spread out, and found faster. N is the number of whole cells in the frame, possibly 0. valid: the score is
-    above quality times the frame's maximum, and above `least`, which exceeds the rounding of a blank picture.
+    They spread over the frame, and are found faster than the best of the frame. N is the number of whole
+    cells in the frame, possibly 0. valid: the score is above quality times the frame's maximum, and above `least`,
+    which exceeds the rounding of a blank picture.
 
     >>> points, score, valid = F.grid_features(torch.rand(1, 1, 64, 64), 16)
     >>> points.shape, valid.shape

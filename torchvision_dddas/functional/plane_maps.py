@@ -29,7 +29,7 @@ HORIZON = 1e-6
 
 
 class PlaneModel(NamedTuple):
-    """A kind of map. size: number of pairs that fix it. minimal: its maps from `size` pairs. fit: by least squares."""
+    """A kind of map. size: number of pairs that fix it. minimal: its maps from `size` pairs. fit: least squares."""
 
     size: int
     minimal: Minimal

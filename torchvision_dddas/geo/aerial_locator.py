@@ -416,8 +416,8 @@ def frames_to_locate(table: DetectionTable, landmarks: Landmarks) -> list[int]:
 def check_table(table: DetectionTable, locator: AerialLocator) -> None:
     """Raise InputError if the landmarks cannot place any frame of the table, and say what is missing.
 
-    That is: no place in a picture, one far outside of it, no frame in common, and, without telemetry, fewer than four
-    landmarks in every frame or all of them on one line.
+    Causes are: no landmark has a pixel, a pixel is far outside the picture, or no frame is in common. Without
+    telemetry, causes are also fewer than four landmarks in every frame, or all landmarks on one line.
     """
     landmarks, parameters = locator.site.landmarks, locator.settings.aerial
     if not landmarks.names:

@@ -171,9 +171,9 @@ class TargetSpeeds:
     ) -> Float[np.ndarray, "N 2"]:
         """Return the velocities in the next frame, m/s east and north; NaN if unknown or without identity (below 1).
 
-        covariance_m2: of the errors that are new in every frame; 1 m is used where it is unknown. seen: pixels u, v of
-        the places and their heights above the ground, for `carry`. A frame with the same time as the one before gets
-        the same velocities.
+        covariance_m2: covariance of the errors that are new in every frame; if unknown, a sigma of 1 m. seen: pixels u,
+        v of the places and their heights above the ground, for `carry`. A frame with the same time as the one before
+        gets the same velocities.
         """
         if time_s == self._latest[0]:
             return np.array([self._latest[1].get(name, [math.nan] * 2) for name in identity.tolist()]).reshape(-1, 2)

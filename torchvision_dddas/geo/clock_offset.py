@@ -144,8 +144,8 @@ def find_clock_offset(
 def _fit(logged: np.ndarray, seen: np.ndarray, least: float) -> tuple[float, np.ndarray]:
     """Return the likelihood of the turns of a log (N, 3), given those of a clip (N, 3), and their scale (3,).
 
-    It is the logarithm for one turn, with normal residuals of unknown variance in each axis. least: with fewer common
-    turns the likelihood is 0.
+    The likelihood is a logarithm for one turn, with normal residuals of unknown variance in each axis. least: with
+    fewer common turns the likelihood is 0.
     """
     known = np.isfinite(logged + seen).all(axis=1)
     if known.sum() < least:

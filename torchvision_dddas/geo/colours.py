@@ -136,9 +136,8 @@ def calibrate_colours(
     """Find the colours of landmarks in (H, W, 3) uint8 BGR pictures that show all of them.
 
     count: number of colours; None: as many as names, or all clear colours. names: names in HUES get the nearest colour,
-    others the remaining colours by hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture,
-    used instead of a search. Raise InputError for a box without a strong colour, too few colours, or two similar
-    colours.
+    others the rest by hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture, used instead of
+    a search. Raise InputError for a box without a strong colour, too few colours, or two similar colours.
     """
     hsv = [to_hsv(image) for image in images]
     if boxes:

@@ -140,7 +140,7 @@ class JointFilter:
         self._condition(by_state, joint, self.state[other] - self.state[one])
 
     def _condition(self, by_state: np.ndarray, joint: np.ndarray, residual: np.ndarray, for_now: bool = False) -> None:
-        """Condition the state on linear measurements. by_state: their covariance with the state. joint: their own."""
+        """Condition the state on linear measurements. by_state: covariance with the state. joint: their covariance."""
         gain = np.linalg.solve(joint, by_state).T
         considered = self._considered()
         gain[considered] = 0.0

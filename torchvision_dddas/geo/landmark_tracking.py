@@ -325,7 +325,7 @@ class LandmarkTracker:
         return separate(predicted, blobs, self._parameters, near | np.isnan(centre[:, :1]))
 
     def _shared(self, match: np.ndarray, touching: np.ndarray, area: np.ndarray, blob_area: np.ndarray) -> np.ndarray:
-        """Return (N,) bool: blobs much larger than the landmarks at them explain. Also update the usual ratios.
+        """Return (N,) bool: whether a blob is much larger than its landmarks explain. Also update the usual ratios.
 
         touching: (K, N) bool. area: (K,) areas of the landmarks' colours, NaN if not seen.
         """

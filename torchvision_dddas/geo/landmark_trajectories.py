@@ -43,7 +43,7 @@ class _Track:
 
 
 class LandmarkTrajectories:
-    """The places of landmarks over a clip; `at` gives those of one frame.
+    """The places of landmarks over a clip; `at` returns the landmarks of one frame.
 
     Between reports a landmark goes straight on. An unusually long gap is a dropout. In a dropout the landmark follows
     its planned waypoints, shifted by the distance of its reports from them. Without a plan it goes straight from report

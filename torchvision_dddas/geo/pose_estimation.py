@@ -45,7 +45,7 @@ class Prior:
 
     @property
     def known(self) -> Bool[np.ndarray, "7"]:
-        """(7,) which parameters have a prior."""
+        """(7,) whether each parameter has a prior."""
         return np.diag(self.information) > 0
 
 
@@ -297,7 +297,7 @@ def move_pose(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
 def _turned_about_up(
     marks: LandmarkObservations, camera: Camera, known: np.ndarray, pose: CameraPose
 ) -> list[CameraPose]:
-    """With a known tilt, pixels on the ground lack only turn, scale and place, which the landmarks determine."""
+    """Turn, raise and shift a pose so that its pixels meet the landmarks; no pose if the tilt is unknown."""
     if not known[:2].all() or len(marks) == 0:
         return []
     way = rays(marks.image_px, pose, camera)

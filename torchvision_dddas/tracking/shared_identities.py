@@ -122,7 +122,7 @@ def _search(frames: Sequence[tuple[ViewTargets, ViewTargets]], rng: np.random.Ge
 
 
 class _PairOfViews:
-    """The registration of two views, which is searched again while there is none."""
+    """The registration of two views. While it is unknown, it is searched again."""
 
     def __init__(self, memory_frames: int) -> None:
         self.follower: _Follower | None = None

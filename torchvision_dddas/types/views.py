@@ -29,7 +29,7 @@ class SharedFrame(Record):
     """One moment of several views.
 
     moment: number of the frame in the input, from 1. views: the input, with identities that all views share.
-    own: (N,) of each view, the identities in the input. maps: by the numbers of two views, from 0.
+    own: (N,) of each view, the identities in the input. maps: the map of two views, by their numbers from 0.
 
     >>> one = td.Tracks(3, np.array([1]), np.array([[10.0, 20, 5, 9]]), np.ones(1), np.zeros(1, int))
     >>> frame = td.SharedFrame(3, (one, one), (np.array([7]), np.array([4])), {(0, 1): td.ViewMap(None, 0.0)})

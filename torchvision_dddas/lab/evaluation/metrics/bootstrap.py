@@ -16,10 +16,10 @@ FEWEST = 5
 """Fewest independent blocks for an interval. The range of five values misses their median in 1 of 16 cases."""
 
 LONGER = 2.0
-"""Blocks that estimate a variance best are too short for intervals, which then contain the truth less often."""
+"""Blocks are this much longer than blocks that estimate a variance best, which make intervals too short."""
 
 Statistic = Callable[[np.ndarray], dict[str, float]]
-"""A function from weights of units, (U,), how often each unit counts, to measures by name; NaN if undefined."""
+"""A function from (U,) weights to measures by name, NaN if undefined. A weight is how often a unit counts."""
 
 
 class ConfidenceInterval(NamedTuple):
@@ -146,8 +146,8 @@ _ROUNDING = 1e-9
 class Effect(NamedTuple):
     """The difference of a measure, the second result minus the first. interval: None if there are too few blocks.
 
-    p: probability of so large a difference if the two results were exchangeable; NaN if it cannot be computed. least:
-    the smallest p that so few blocks can give.
+    p: probability of a difference this large if the two results were exchangeable; NaN if it cannot be computed. least:
+    the smallest p that this number of blocks can give.
     """
 
     value: float

@@ -162,8 +162,8 @@ class Ranking:
 
         AP is the area under the precision-recall curve, where the precision at a recall is the best precision at this
         recall or above; 0 if nothing right is found. The miss rate is the share of true boxes that are missed with at
-        most so many false positives; its geometric mean is over RATES. NaN without a true box. Source: PASCAL VOC from
-        2010 on; Dollár et al., 2012.
+        most this number of false positives; its geometric mean is over RATES. NaN without a true box. Source: PASCAL
+        VOC from 2010 on; Dollár et al., 2012.
         """
         once = np.ones(len(self.true)) if weight is None else weight
         true, images = float(once @ self.true), float(once @ self.images)

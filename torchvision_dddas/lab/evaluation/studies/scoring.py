@@ -85,7 +85,7 @@ def by_task(clip: ClipScore, interval: int = 1) -> dict[Task, Scored]:
 
 
 def _spread(clip: ClipScore, interval: int) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
-    """Return the scored frames (F,) and their counts (F,), by group and name. interval: of tracks, 0 for boxes and masks.
+    """Return the scored frames (F,) and their counts (F,), by group and name. interval: of tracks, else 0.
 
     Tracks are also scored on frames without boxes. Such frames have counts of 0, which is a result.
     """

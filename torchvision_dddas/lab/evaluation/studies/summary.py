@@ -256,7 +256,7 @@ def flat(counts: Any) -> np.ndarray:
 
 
 def _shaped(row: np.ndarray, like: Any) -> Any:
-    """Return such a row as counts in the form of `like`."""
+    """Return a row of `flat` as counts in the form of `like`."""
     parts, at = [], 0
     for part in like:
         size = len(flat(part))
@@ -298,7 +298,7 @@ def _table(scored: Scored, group: str, names: Sequence[str]) -> np.ndarray:
 
 
 def _influence(table: np.ndarray, of_sums: Callable[[np.ndarray], dict[str, float]]) -> np.ndarray:
-    """Return what each frame adds to each measure, to first order, (U, K)."""
+    """Return the contribution of each frame to each measure, to first order, (U, K)."""
     whole = table.sum(axis=0)
     slopes = []
     for step in np.diag(1e-4 * np.maximum(np.abs(whole), 1)):
