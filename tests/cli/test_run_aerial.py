@@ -94,7 +94,7 @@ def test_a_uav_that_is_elsewhere_in_time_or_space_is_noted(run, uav, tmp_path):
     late = uav("late", {"starts_s": 60})
     assert run("--aerial", far / "far.toml", "--aerial", late / "late.toml").exit_code == 0
     notes = " ".join(record(tmp_path / "out")["notes"])
-    assert "far locates" in notes and "none of them was found to be one" in notes and "late was not used" in notes
+    assert "far locates" in notes and "was recognized as a target of another" in notes and "late was not used" in notes
 
 
 def test_a_live_run_a_run_without_places_and_the_same_file_twice_are_refused(dddas, run, uav):

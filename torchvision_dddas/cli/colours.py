@@ -91,7 +91,7 @@ def _check(count: int | None, names: list[str], box_names: list[str]) -> None:
     if count is not None and not 1 <= count <= MOST:
         raise InputError(f"--count must be 1 to {MOST}, because more colours cannot be distinguished; got {count}")
     if count is not None and names and len(names) != count:
-        raise InputError(f"--count is {count}, but --names has {len(names)} names; give as many")
+        raise InputError(f"--count is {count}, but --names has {len(names)} names; give as many names")
 
 
 def _describe(found: "CalibratedColours", pictures: int) -> list[str]:

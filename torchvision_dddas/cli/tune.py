@@ -36,7 +36,7 @@ def tune(
     parameters: Annotated[
         str, typer.Option(metavar="NAME,...", help="Parameters, such as difference.threshold or 'difference.*'.")
     ],
-    steps: Annotated[int, typer.Option(metavar="N", help="Most steps.")] = 100,
+    steps: Annotated[int, typer.Option(metavar="N", help="Largest number of steps.")] = 100,
     holdout: Annotated[
         str | None,
         typer.Option(metavar="PATTERN,...", help="Held-out clips: not used for tuning, measured before and after."),
@@ -55,12 +55,12 @@ def tune(
     pull: Annotated[
         float,
         typer.Option(
-            help="Weight of the pull toward the first values, about 0.1 for few examples. A factor e costs half of it."
+            help="Weight of half the squared distance from the first values in the loss; about 0.1 for few examples."
         ),
     ] = 0.0,
     watched: Annotated[
         float,
-        typer.Option(help="Share of each clip's examples that is not learned from, but chooses the best step."),
+        typer.Option(help="Share of each clip's examples that choose the best step, and are not learned from."),
     ] = 0.25,
     patience: Annotated[
         int, typer.Option(metavar="N", help="Stop after N checks, one per 5 steps, without a gain.")
@@ -69,9 +69,7 @@ def tune(
     device: Annotated[str, typer.Option(help="The device of the computation: cpu, cuda, cuda:1.")] = "cpu",
     measure: Annotated[
         str | None,
-        typer.Option(
-            metavar="TASK.GROUP.MEASURE", help="Measured before and after. [default: by the parameters' family]"
-        ),
+        typer.Option(metavar="TASK.GROUP.MEASURE", help="The measure to compare. [default: by the parameters' family]"),
     ] = None,
     clips: Clips = None,
     jobs: Jobs = None,

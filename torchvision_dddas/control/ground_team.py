@@ -221,15 +221,15 @@ class GroundTeam:
         for name, weight in self.fusion.weights.items():
             if weight < _DOUBTED:
                 off = math.hypot(*self.fusion.offsets_m[name])
-                self.notes.append(f"{name} is {off:.1f} m off where the others agree: its weight is {weight:.2f}")
+                self.notes.append(f"{name} is {off:.1f} m from where the others agree: its weight is {weight:.2f}")
 
     def _unmatched(self, name: str) -> str:
         """Return the possible reasons why no other platform sees the targets that a platform locates."""
         if name in self.further:
             return (
-                f"{name} locates targets, and none of them was found to be one that another platform sees. That takes "
-                "about 3 s in which both see the same three or more, or fewer with nobody near; right places and "
-                "starts_s, too"
+                f"{name} locates targets, and none of them was recognized as a target of another platform. Recognition "
+                "takes about 3 s in which both platforms see the same three targets or more, or fewer if no other "
+                "target is near; it needs correct places and starts_s"
             )
         nearest = f"; the nearest is {self._nearest_m[name]:.0f} m away" if name in self._nearest_m else ""
         return (

@@ -75,7 +75,7 @@ class FrameFix:
         """Return this fix for a frame that repeats the picture; a picture that is too old locates nothing."""
         old_s, fix = time_s - self.fix.time_s, replace(self.fix, frame=frame, changes=())
         if old_s > _FROZEN_S:
-            cause = f"the camera is frozen: the picture is that of frame {self.fix.frame}"
+            cause = f"the camera is frozen: the picture repeats frame {self.fix.frame}"
             fix = no_fix(frame, self.marks, cause)
         return FrameFix(replace(fix, time_s=self.fix.time_s), self.marks, time_s=time_s)
 
@@ -443,8 +443,8 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
     if not counts.any():
         first, last = np.round(landmarks.frame[seen][[0, -1]]).astype(int).tolist()
         raise InputError(
-            f"the table has frames {table.first} to {table.last}, the landmarks are seen in {first} to {last}: none "
-            "in common has a landmark of known place; are both counted from the clip's first frame, as 1?"
+            f"the table has frames {table.first} to {table.last}, the landmarks are seen in {first} to {last}: no "
+            "common frame has a landmark of known place; is the clip's first frame number 1 in both?"
         )
     if locator.site.telemetry is not None and parameters.mode == "pose":
         return
@@ -452,7 +452,7 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
         best = int(counts.argmax())
         missing = LEAST - int(counts[best])
         raise InputError(
-            f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has {counts[best]}, none more: "
+            f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has most, {counts[best]}: "
             f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
         )
     enough = np.flatnonzero(counts >= LEAST).tolist()

@@ -114,14 +114,14 @@ def _take_heading(telemetry: Telemetry, parameters: AerialParameters) -> tuple[T
     with_sigma = f"with a sigma of {parameters.course_sigma_deg:g} degrees"
     if not _lacks(telemetry, "vehicle_heading_rad"):
         heading_rad, sigma, source = telemetry.vehicle_heading_rad, np.full(len(telemetry), sigma_rad), NOSE
-        note = f"that of the vehicle's nose is taken, {with_sigma} (aerial.course_sigma_deg)"
+        note = f"the heading of the vehicle's nose is used, {with_sigma} (aerial.course_sigma_deg)"
     else:
         heading_rad, fit_rad = course_over_ground(telemetry.time_s, telemetry.place)
         sigma, source, known = np.hypot(fit_rad, sigma_rad), COURSE, np.isfinite(heading_rad)
         if not known.any():
             return telemetry, []
         note = (
-            f"the course over ground is taken where it is straight, in {100 * known.mean():.0f} % of the samples, "
+            f"the course over ground is used where it is straight, in {100 * known.mean():.0f} % of the samples, "
             f"{with_sigma} or more (aerial.course_sigma_deg)"
         )
     filled = replace(telemetry, heading_rad=heading_rad, heading_sigma_rad=sigma, heading_from=source)
