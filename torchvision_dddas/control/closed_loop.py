@@ -273,9 +273,9 @@ class Steering:
         """Return the command after a frame was located, in local metres, and the adjustments with their causes.
 
         confirmed: its rows are rows of located.positions. now_s: time of the newest frame read, which is later than the
-        located frame. marks, flight: current reports of the ground vehicles and of the aerial vehicle, in local metres,
-        altitude above up = 0; None while silent. step: the background's motion to the located frame. crowds: crowds
-        seen from the ground at that frame.
+        located frame. marks, flight: current reports of the ground vehicles and of the aerial vehicle, in local metres;
+        None while silent. The altitude counts from up = 0. step: the background's motion to the located frame. crowds:
+        crowds seen from the ground at that frame.
         """
         parameters = self.settings.steering
         self._log.begin(located.frame)

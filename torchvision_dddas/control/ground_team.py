@@ -176,7 +176,7 @@ class GroundTeam:
         self.finish()
 
     def add(self, result: FrameResult) -> FrameResult:
-        """Return the next result, with the views of the other platforms since the one before."""
+        """Return the next result, with the views of the other platforms since the previous result."""
         located = result.locations
         if located is None or not math.isfinite(located.time_s) or result.repeats:
             return result

@@ -209,8 +209,8 @@ def svm_scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
     batch, _, ny, nx = block_map.shape
     down, across, _ = weights.shape
     part = torch.matmul(weights.flatten(0, 1), block_map.flatten(2))  # (B, down x across, ny nx)
-    # Sum over the blocks of a window. Part (i, j) is read i rows and j columns further on. Padding each part shifts it
-    # by its own offset, so that one sum over the parts needs no copy of each.
+    # Sum over the blocks of a window: the block in row i, column j of a window has part (i, j) of the weights. Padding
+    # shifts part (i, j) by i rows and j columns, so that one sum over the parts adds the blocks of each window.
     places = ny * nx
     part = (
         torch.nn.functional.pad(part.reshape(batch, down, -1), (0, across)).unflatten(-1, (across, places + 1)).sum(2)

@@ -35,7 +35,7 @@ _SURE, _FINEST = 0.03, 0.01
 
 @dataclass(frozen=True)
 class MountedPose:
-    """height_m: height of the camera. pitch_rad: downwards. Each has its standard deviation. miss: median residual."""
+    """The height and the pitch (downwards) of a camera, with standard deviations. miss: median residual."""
 
     height_m: float
     pitch_rad: float

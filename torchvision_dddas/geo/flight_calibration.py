@@ -67,9 +67,9 @@ class FlightErrors:
     wrong: tuple[tuple[int, int], ...]
 
     def settings(self, before: AerialParameters, without: Sequence[str] = ()) -> dict[str, float]:
-        """Return the parameters that state these errors, except for parts in `without` and parts not determined.
+        """Return the parameters that describe these errors, without the parts `without` and undetermined parts.
 
-        An offset without a parameter is added to the error of its part, by its mean square.
+        An offset that has no parameter increases the standard deviation of its part, by its mean square.
         """
         squares = self.offset_sigma**2 + self.offset**2 * (np.arange(7) > 1)
         beside = np.array([squares[:6][part == PART_OF_OFFSET].mean() for part in range(4)])

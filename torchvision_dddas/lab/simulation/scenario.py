@@ -72,7 +72,7 @@ class CrowdPlan(Group):
         "walk", "walk: along way_m or heading_deg; random: a new velocity each time unit; stand: stay"
     )
     speed_m_s: float = parameter(1.4, "their walking speed", "m/s", 0, 10)
-    heading_deg: float = parameter(90.0, "direction, clockwise from north, without way_m", "deg", -360, 360)
+    heading_deg: float = parameter(90.0, "direction if way_m is empty, clockwise from north", "deg", -360, 360)
     way_m: tuple[Place, ...] = parameter((), "waypoints, walked there and back", "m")
     from_s: float = parameter(0.0, "start time; until then they stand", "s", 0, 86400)
 
@@ -81,7 +81,7 @@ class CarPlan(Group):
     """A car. Cars are not landmarks."""
 
     start_m: Place = parameter((0.0, 0.0), "its initial position", "m")
-    heading_deg: float = parameter(90.0, "direction, clockwise from north, without way_m", "deg", -360, 360)
+    heading_deg: float = parameter(90.0, "direction if way_m is empty, clockwise from north", "deg", -360, 360)
     speed_m_s: float = parameter(6.0, "its driving speed", "m/s", 0, 40)
     way_m: tuple[Place, ...] = parameter((), "waypoints, driven there and back", "m")
     from_s: float = parameter(0.0, "its start time", "s", 0, 86400)
