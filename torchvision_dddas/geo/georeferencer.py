@@ -164,8 +164,8 @@ class BiasFilter:
     ) -> tuple[float, "BiasFilter"]:
         """Return the log density of a picture under the prediction, and the filter updated by the picture.
 
-        shown_px: (2m,) pixels of the landmarks used as a linear function of the errors, with slopes (2m, 7 + 2n). The
-        telemetry must give all seven parameters of the pose.
+        shown_px: (2m,) pixels of the used landmarks, linear in the errors with slopes (2m, 7 + 2n). The telemetry
+        must give all seven parameters of the pose.
         """
         ours, _ = self._matching_rows(np.ones(7, bool), marks)
         variance = np.repeat(marks.pixel_sigma[used], 2) ** 2

@@ -48,7 +48,7 @@ def student_factor(freedom: float) -> float:
 
 
 def measure_misfit(solution: PoseSolution, marks: LandmarkObservations, used: Bool[np.ndarray, "n"]) -> Misfit:
-    """Measure the misfit of the landmarks of a frame's solution, in the standard deviations of the marks."""
+    """Measure the misfit of the landmarks of a frame's solution, in units of their stated standard deviations."""
     weight = 1 / np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2) ** 2
     seen = 1 / np.repeat(marks.pixel_sigma[used], 2) ** 2
     squares = weight @ solution.correction[7:] ** 2 + seen @ solution.missing**2

@@ -172,7 +172,7 @@ class ImageSource(_Clip):
             raise InputError(f"{name} holds no images")
         self.files, self.count, self.rate_hz = list(files), len(files), rate_hz or 10.0
         self.assumes_rate = rate_hz is None
-        # The input is all pictures together: a few hundred photos are not a small input.
+        # All pictures together are one input, so a few hundred photos do not count as a small input.
         sizes = accumulate(file.stat().st_size for file in files if file.is_file())
         size = next((size for size in sizes if size >= SMALL_FILE), None)
         self._read = partial(read_image, cost=cost_of_pictures(len(files)), size=size)

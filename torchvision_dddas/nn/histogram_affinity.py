@@ -35,7 +35,7 @@ class HistogramAffinity(nn.Module):
         """Return affinities, (W, N, N) for windows of K = 2 frames, (W, N, N, N) for 3; 0 if a box is missing.
 
         clip: RGB in [0, 1]. box_px: x, y, width, height, padded to N boxes in each frame. valid: whether each box
-        exists. windows: indices of their frames in the clip, newest first.
+        exists. windows: indices of the frames of each window, newest first.
         """
         return self.affinity(*self.histograms(clip, box_px, valid), windows)
 
