@@ -212,8 +212,7 @@ def ransac(
     Take the best of all hypotheses, then fit least squares to its inliers with tightening tolerances (appendix B, step
     S3). Hypotheses are ranked by their truncated squared error, which also ranks equal numbers of inliers. samples:
     from `draw_samples`; the numbers are spread over the valid points if some are not valid. If none fits, return the
-    identity, not reliable.
-    Raise InputError without any points.
+    identity, not reliable. Raise InputError without any points.
 
     >>> p = torch.rand(1, 50, 2) * 100
     >>> q = p + 5

@@ -46,10 +46,9 @@ def separate(
     """Return (n,) int64, the blob of each landmark, -1 for none; no two landmarks share a blob.
 
     colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of moving blobs. allowed: (n, m)
-    bool, permitted pairs.
-    exact: the largest number of matches within reach_px, then the least total distance. The source requires one blob
-    for each landmark, which is infeasible if a landmark has none in reach; its text says "if any". greedy: the source's
-    heuristic; each landmark in turn takes the nearest blob that is left.
+    bool, permitted pairs. exact: the largest number of matches within reach_px, then the least total distance. The
+    source requires one blob for each landmark, which is infeasible if a landmark has none in reach; its text says "if
+    any". greedy: the source's heuristic; each landmark in turn takes the nearest blob that is left.
     """
     distance = np.linalg.norm(colour_px[:, None] - blob_px[None], axis=2)
     within = (distance <= parameters.reach_px) & allowed  # False for NaN

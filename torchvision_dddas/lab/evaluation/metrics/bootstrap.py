@@ -93,8 +93,7 @@ def block_length(series: np.ndarray) -> int:
     """Return the number of neighbours in a block so that blocks count as independent: the largest over all columns.
 
     series: (U, K), the contribution of each unit, in order, to each measure. The length is at most the units divided by
-    FEWEST.
-    Source: Politis and White, 2004, with the correction of 2009, for the circular block bootstrap.
+    FEWEST. Source: Politis and White, 2004, with the correction of 2009, for the circular block bootstrap.
     """
     units = len(series)
     most = max(1, min(math.ceil(3 * math.sqrt(units)), units // FEWEST))

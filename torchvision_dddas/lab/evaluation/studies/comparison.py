@@ -251,8 +251,7 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
 def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
     """Return the section of a task: plots clip by clip, all clips together, single clips.
 
-    anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of
-    columns.
+    anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
     columns = [Column("clip", text=True), *_columns(first, second, {WAYS[1]: ""})]
     by_clip = [
