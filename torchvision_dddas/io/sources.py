@@ -283,8 +283,8 @@ class _Stamps:
         if not usual or not odd:
             return ""
         return (
-            f"the frame rate varies: pictures are {usual} ms apart, but {odd} steps last {steps[0]} to {steps[-1]} ms; "
-            "all times are from the file"
+            f"the frame rate varies: pictures are {steps[0]} to {steps[-1]} ms apart, usually {usual} ms "
+            f"(exceptions: {odd}); all times are from the file"
         )
 
 
