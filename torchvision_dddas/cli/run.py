@@ -136,6 +136,23 @@ def run(
     wait: Annotated[
         bool, typer.Option("--wait", help="With --live: wait for a camera or stream that is not there yet.")
     ] = False,
+    command: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LINK",
+            help="With --live: a vehicle, mavlink:udp:HOST:PORT, ...; its commands are printed, and not sent.",
+        ),
+    ] = None,
+    allow_commands: Annotated[
+        bool, typer.Option("--allow-commands", help="Send the commands, inside --geofence and --altitude-band.")
+    ] = False,
+    geofence: Annotated[
+        str | None,
+        typer.Option(metavar="FILE|LON,LAT,M", help="GeoJSON or KML of polygons, or a circle: where it may fly."),
+    ] = None,
+    altitude_band: Annotated[
+        str | None, typer.Option(metavar="LOW,HIGH", help="Metres above home between which it may fly.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what moves in a clip from the air, give it lasting identities, and locate it.
@@ -160,13 +177,17 @@ def run(
         raise InputError(f"one clip and {len(logs)} logs; give one --telemetry")
     platforms = {"--ground": ground[0] if ground else None, "--aerial": aerial[0] if aerial else None}
     given_boxes = {"--detections": detections, "--detector": detector, "--movers": movers or None}
+    limits = {"--allow-commands": allow_commands or None, "--geofence": geofence, "--altitude-band": altitude_band}
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
         others["--detections"] = detections
-        refuse_options(others, "is of no use with --live, which draws and steers nothing")
+        refuse_options(others, "is of no use with --live, which draws and simulates nothing")
+        if command is None:
+            refuse_options(limits, "is for --command mavlink:...; give it too")
     else:
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
-        refuse_options(others, "is for a run that keeps up with a camera; give --live too")
+        others["--command"] = command
+        refuse_options({**others, **limits}, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--geoid": geoid, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--ignore": ignore, **beside}
@@ -199,7 +220,7 @@ def run(
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_settings(config, set_, ignore, quiet, geoid)
     if live:
-        from torchvision_dddas.live import run_live
+        from torchvision_dddas.live import CommandOptions, run_live
 
         code = run_live(
             out,
@@ -220,6 +241,7 @@ def run(
             aerial or (),
             network,
             movers,
+            None if command is None else CommandOptions(command, allow_commands, geofence, altitude_band),
         )
         raise typer.Exit(Ended(code))  # the last line on the screen says where the results are
     from torchvision_dddas import open_video

@@ -1,11 +1,13 @@
 """Live runs: capture in a thread of its own, load shedding, health, and a server for the health."""
 
 from torchvision_dddas.live.capture import LiveSource
+from torchvision_dddas.live.commanding import CommandOptions
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.runner import LoadShedding
 from torchvision_dddas.live.session import run_live
 
 __all__ = [
+    "CommandOptions",
     "Health",
     "LiveSource",
     "LoadShedding",

@@ -116,8 +116,13 @@ class Health:
                     words = f"{a.describe()}: {a.cause}"
                     self._unwritten.append(Event(time.time(), a.frame, "adjusted", words))
 
+    def log(self, kind: str, text: str) -> None:
+        """Add an event for events.log only: one that is too frequent for the terminal and the page."""
+        with self._lock:
+            self._unwritten.append(Event(time.time(), 0, kind, readable(without_secrets(text))))
+
     def take_adjusted(self) -> list[Event]:
-        """Return the changes of parameters since the last call, as events."""
+        """Return the events for events.log only, such as changes of parameters, since the last call."""
         with self._lock:
             taken, self._unwritten = self._unwritten, []
         return taken

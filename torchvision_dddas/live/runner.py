@@ -12,6 +12,7 @@ import numpy as np
 from torchvision_dddas import control
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import AerialLocator
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.frame_queue import Clock
@@ -35,7 +36,7 @@ class Feed:
     A step lasts from the moment a frame is taken until the next one is requested. newest: the frame taken last. log:
     the telemetry. telemetry: a function that returns it, as the pipeline expects of a source; None if there is none.
     clock_offset_s: the offset of the camera's clock, with which `align_log` aligns a log that has a clock. aligned: is
-    called with the aligned log.
+    called with the aligned log. locator: of the pipeline that runs now; None if nothing is located.
     """
 
     count = None
@@ -52,6 +53,7 @@ class Feed:
         self.log, self.clock_offset_s, self._silent, self._start_utc_s = telemetry, nan, False, nan
         self.telemetry = None if telemetry is None else lambda: self.log
         self.aligned: Callable[[Telemetry], object] = lambda log: None
+        self.locator: AerialLocator | None = None
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from math import inf, isnan, nan
 from pathlib import Path
@@ -30,6 +30,7 @@ from torchvision_dddas.io.output import (
 from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
+from torchvision_dddas.live.commanding import CommandOptions, open_commands
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
 from torchvision_dddas.live.log_alignment import describe_landmarks, describe_log
 from torchvision_dddas.live.receiver import DeadCamera
@@ -78,12 +79,13 @@ def run_live(
     aerial: Sequence[Path] = (),
     detector: OnnxDetector | None = None,
     movers: bool = False,
+    commanding: CommandOptions | None = None,
 ) -> int:
     """Run until the pictures end or a signal ends the run, and return the exit code. Write a new folder under out.
 
     SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. wait: wait for an
-    absent camera at the start. detector, movers: as for `Pipeline`. Raise InputError for any other fault at the start;
-    a later fault becomes an event.
+    absent camera at the start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of
+    its commands. Raise InputError for any other fault at the start; a later fault becomes an event.
     """
     address = None if serve is None else parse_address(serve)
     if wait and stream_target(clip) is None:
@@ -144,6 +146,13 @@ def run_live(
         if site is not None and not is_recording:
             ready.notes.extend(describe_landmarks(site.landmarks))
         team = LiveTeam((ground, aerial), settings, backend, ready.watch, source, health) if ground or aerial else None
+        commands = None
+        if commanding is not None:
+            if commanding.allow and is_recording:
+                raise InputError(f"--allow-commands is for a camera or a stream, but {name} shows another time")
+            locator = None if ready.watch is None else ready.watch.locator
+            opening = open_commands(commanding, ready.settings, source.size, source.rate_hz, locator, health)
+            commands = stack.enter_context(opening)
         # For a recording, times of day come from its own log, if the log has a clock.
         recorded_utc_s = flight.start_utc_s if is_recording and flight is not None else nan
         begin = build_path(ready, source, people, interval, backend, health, prepare, detector, movers)
@@ -167,6 +176,7 @@ def run_live(
         if given is not None and ready.watch is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
         facts |= {key: paths for key, paths in (("ground", ground), ("aerial", aerial)) if paths}
+        facts |= {"command": asdict(commanding)} if commanding is not None else {}
         facts |= {} if detector is None else {"detector": detector.facts, "movers": movers}
         facts["settings"] = ready.settings.model_dump()
         log = SessionLog(folder, facts)
@@ -206,6 +216,7 @@ def run_live(
         try:
             for located, seen in results(begin, feed, health):
                 located = located if team is None else team.add(located)
+                located = located if commands is None else commands.update(located, feed)
                 if events := (*located.events, *(zones.update(located) if zones else ())):
                     located = replace(located, events=events)
                     counts.add(events)
@@ -317,6 +328,7 @@ def build_path(
             return settings, adjustments
 
         running = None if watch is None else watch.restarted()
+        feed.locator = None if running is None else running.locator
         if running is not None and feed.log is not None:
             locator = running.locator
             feed.aligned = lambda log: locator.set_site(replace(locator.site, telemetry=log))
