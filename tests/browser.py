@@ -1,13 +1,20 @@
-"""Headless Chromium for tests: what a script finds in a page, read from the dumped DOM."""
+"""Headless Chromium for tests: what a script finds in the dumped DOM of a page, and pages that a server sends."""
 
+import base64
 import html
 import json
+import os
 import re
+import select
 import shutil
 import subprocess
+import time
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+import cv2
+import numpy as np
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -45,3 +52,113 @@ def evaluate(page: str, script: str, folder: Path, width: int = 1280, dark: bool
     found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout.decode(), re.DOTALL)
     assert found is not None, done.stdout[-500:]
     return json.loads(html.unescape(found[1]))
+
+
+class Navigated(Exception):
+    """The browser refused a call, as it does while a page is replaced."""
+
+
+class Browser:
+    """Chromium that opens served pages, driven by the DevTools protocol over pipes; used as a context.
+
+    requested: the addresses that pages asked for. trouble: their errors and warnings, those of the policy too.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """folder: for the browser's files."""
+        assert CHROMIUM, "no Chromium on this machine"
+        self.requested: list[str] = []
+        self.trouble: list[str] = []
+        self._session: str | None = None
+        self._buffer, self._number = b"", 0
+        ours_in, theirs_out = os.pipe()
+        theirs_in, ours_out = os.pipe()
+        flags = [*FLAGS, f"{OFFLINE}, EXCLUDE 127.0.0.1", f"--user-data-dir={folder / 'profile'}"]
+        command = [CHROMIUM, *flags, "--hide-scrollbars", "--remote-debugging-pipe", "about:blank"]
+        line = f'exec "$@" 3</dev/fd/{theirs_in} 4>/dev/fd/{theirs_out}'
+        self._process = subprocess.Popen(
+            ["sh", "-c", line, "sh", *command],
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._in, self._out = ours_in, ours_out
+
+    def __enter__(self) -> Self:
+        target = self._call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self._call(f"{domain}.enable")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait(60)
+        os.close(self._in)
+        os.close(self._out)
+
+    def open(self, url: str, width: int = 1280, height: int = 900, phone: bool = False) -> None:
+        """Show a page in a window of a size in CSS pixels. phone: with touch, and two pixels a CSS pixel."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 2 if phone else 1, "mobile": phone}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+        self._call("Page.navigate", url=url)
+
+    def evaluate(self, script: str) -> Any:
+        """Return the value of an expression in the page, or of its promise."""
+        answer = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def wait(self, script: str, seconds: float = 60.0) -> Any:
+        """Wait until an expression is true, and return its value. The page may load itself again meanwhile."""
+        until_s = time.monotonic() + seconds
+        while True:
+            with suppress(Navigated):
+                if found := self.evaluate(script):
+                    return found
+                text = self.evaluate("document.body?.innerText")
+                assert time.monotonic() < until_s, f"{script} stays {found!r}; {text}"
+            time.sleep(0.1)
+
+    def picture(self) -> np.ndarray:
+        """Return a screenshot, (H, W, 3) uint8 BGR."""
+        png = base64.b64decode(self._call("Page.captureScreenshot")["data"])
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return image
+
+    def _call(self, method: str, **parameters: Any) -> Any:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive()
+            if answer.get("id") == self._number:
+                if "error" in answer:
+                    raise Navigated(method, answer["error"])
+                return answer["result"]
+            self._note(answer.get("method"), answer.get("params", {}))
+
+    def _receive(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            assert select.select([self._in], [], [], 60.0)[0], "the browser does not answer"
+            more = os.read(self._in, 1 << 20)
+            assert more, "the browser has ended"
+            self._buffer += more
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        found: dict[str, Any] = json.loads(message)
+        return found
+
+    def _note(self, event: str | None, about: dict[str, Any]) -> None:
+        if event == "Network.requestWillBeSent":
+            self.requested.append(about["request"]["url"])
+        elif event == "Log.entryAdded" and about["entry"]["level"] in ("error", "warning"):
+            self.trouble.append("{text} {url}".format(**{"url": "", **about["entry"]}))
+        elif event == "Runtime.exceptionThrown" or (
+            event == "Runtime.consoleAPICalled" and about["type"] in ("error", "warning")
+        ):
+            self.trouble.append(json.dumps(about))

@@ -385,6 +385,58 @@ def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path,
         assert "rtsp://127.0.0.1:554/live?channel=1" in shown[name].replace("&amp;", "&")
 
 
+def test_a_run_serves_its_annotated_pictures_and_its_state_to_those_who_have_the_token(dddas, film_camera, tmp_path):
+    film_camera(10_000)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    seen: dict[str, Any] = {}
+
+    def ask(path: str) -> Any:
+        given = {"Authorization": "Bearer token-of-the-test"}
+        return urllib.request.urlopen(
+            urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=given), timeout=60
+        )
+
+    def watch_and_end() -> None:
+        try:
+            for _ in range(600):
+                with suppress(OSError), ask("/picture.mjpg") as stream:
+                    while (line := stream.readline()) and not line.startswith(b"Content-Length: "):
+                        pass
+                    stream.readline()
+                    seen["picture"] = stream.read(int(line.split()[1]))
+                    break
+                time.sleep(0.05)
+            with ask("/state.json") as page:
+                seen["state"] = json.load(page)
+            with suppress(urllib.error.HTTPError):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/state.json", timeout=60)
+                seen["open"] = True
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch_and_end, daemon=True).start()
+    given = ("--serve", port, "--serve-token", "token-of-the-test", "--out", tmp_path)
+    done = dddas("run", "rtsp://127.0.0.1:9/live", *FAST, *given)
+    assert done.exit_code == 0, done.output
+    assert "token-of" not in done.output and "open" not in seen
+    picture = cv2.imdecode(np.frombuffer(seen["picture"], np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None and picture.shape == (180, 240, 3)
+    assert seen["state"]["frame"] > 0 and seen["state"]["map"] is None
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--serve", "0", "--serve-token", "secret;"), "--serve-token has 7 characters; give 8 to 200 of letters"),
+        (("--serve-token", "long-enough"), "--serve-token is for --serve PORT; give it too"),
+    ],
+)
+def test_a_token_of_no_use_is_one_line_without_it(dddas, frames, tmp_path, given, words):
+    said = bad(dddas("run", frames, *FAST, *given, "--out", tmp_path / "out"))
+    assert words in said and "secret" not in said and "long-enough" not in said
+
+
 def test_the_page_is_there_while_a_camera_is_waited_for_and_says_so(dddas, tmp_path, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

@@ -214,7 +214,7 @@ def test_each_line_of_metrics_has_the_format_and_a_family_announced_once(health)
     } <= set(text.splitlines())
 
 
-def test_the_page_fetches_nothing_reloads_itself_and_shows_trouble_and_the_latest_events_first(health):
+def test_the_page_loads_own_files_alone_and_shows_trouble_and_the_latest_events_first(health):
     page = html_page(health.snapshot(), 'a<i>"&', "running", "no result for 0:12", refresh_s=3)
     tags = []
 
@@ -223,8 +223,11 @@ def test_the_page_fetches_nothing_reloads_itself_and_shows_trouble_and_the_lates
             tags.append((tag, dict(attrs)))
 
     Reader().feed(page)
-    assert not {"script", "link", "img", "iframe", "i", "b"} & {tag for tag, _ in tags}
-    assert ("meta", {"http-equiv": "refresh", "content": "3"}) in tags
+    assert not {"iframe", "i", "b", "style"} & {tag for tag, _ in tags}
+    assert {about["src"] for tag, about in tags if tag in ("script", "img")} == {"live.js", "picture.mjpg"}
+    assert [about["href"] for tag, about in tags if tag == "link"] == ["live.css"]
+    assert not re.search(r"<script[^>]*>[^<]|\sstyle=|\son\w+=", page)
+    assert ("meta", {"http-equiv": "refresh", "content": "3"}) in tags  # for browsers without scripts
     assert "://" not in page.replace("rtsp://x", "")
     assert "@import" not in page and "url(" not in page
     assert "a&lt;i&gt;&#34;&amp;" in page
@@ -245,7 +248,7 @@ def test_json_is_strict_and_all_pages_show_the_same_trouble(health):
     def answer(patience_s):
         status, kind, text = health_pages(health, run, [run], lambda: run.state, "x", "1", patience_s)["/health.json"]()
         assert kind == "application/json"
-        return status, json.loads(text, parse_constant=refuse)
+        return status, json.loads(str(text), parse_constant=refuse)
 
     run = Run()
     status, found = answer(60.0)
@@ -266,7 +269,7 @@ def test_health_is_not_well_while_a_trouble_lasts_or_most_results_are_late():
 
     def answer():
         status, _, text = health_pages(health, run, [run], lambda: run.state, "x", "1", 60.0)["/health.json"]()
-        return status, json.loads(text)["trouble"]
+        return status, json.loads(str(text))["trouble"]
 
     health.trouble("stream", "camera:0 sends no pictures")
     health.trouble("telemetry", "telemetry is silent")
@@ -368,7 +371,8 @@ def test_requests_are_answered_with_status_type_and_length(server):
     assert (status, body.decode()) == (200, "<p>é")
     assert headers["Content-Type"] == "text/html; charset=utf-8"
     assert headers["Content-Length"] == str(len(body))
-    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    policy = headers["Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self'; ") and "unsafe" not in policy
     assert asked(server, "/bad")[0] == 503
     assert asked(server, "/", "HEAD")[2] == b""
     assert asked(server, "/", "POST")[0] == 501

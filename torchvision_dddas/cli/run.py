@@ -126,7 +126,17 @@ def run(
     ] = None,
     serve: Annotated[
         str | None,
-        typer.Option(metavar="[HOST:]PORT", help="With --live: serve a status page, /metrics and /health.json."),
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="With --live: serve a page with the picture, a map and targets; /metrics and /health.json.",
+        ),
+    ] = None,
+    serve_token: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOKEN",
+            help="Ask for this token, else $DDDAS_SERVE_TOKEN. [default: with a HOST beyond this machine a new token]",
+        ),
     ] = None,
     people: Annotated[bool, typer.Option("--people", help="With --live: also recognize people.")] = False,
     password_file: Annotated[
@@ -184,9 +194,11 @@ def run(
         refuse_options(others, "is of no use with --live, which draws and simulates nothing")
         if command is None:
             refuse_options(limits, "is for --command mavlink:...; give it too")
+        if serve is None:
+            refuse_options({"--serve-token": serve_token}, "is for --serve PORT; give it too")
     else:
-        others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
-        others["--command"] = command
+        others = {"--emit": emit, "--serve": serve, "--serve-token": serve_token, "--command": command}
+        others |= {"--people": people or None, "--wait": wait or None}
         refuse_options({**others, **limits}, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--geoid": geoid, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
@@ -242,6 +254,7 @@ def run(
             network,
             movers,
             None if command is None else CommandOptions(command, allow_commands, geofence, altitude_band),
+            serve_token,
         )
         raise typer.Exit(Ended(code))  # the last line on the screen says where the results are
     from torchvision_dddas import open_video

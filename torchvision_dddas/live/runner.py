@@ -34,9 +34,10 @@ class Feed:
     """The source that the pipeline reads. The stream of frames continues when the pipeline is restarted.
 
     A step lasts from the moment a frame is taken until the next one is requested. newest: the frame taken last. log:
-    the telemetry. telemetry: a function that returns it, as the pipeline expects of a source; None if there is none.
-    clock_offset_s: the offset of the camera's clock, with which `align_log` aligns a log that has a clock. aligned: is
-    called with the aligned log. locator: of the pipeline that runs now; None if nothing is located.
+    the telemetry. seen: is called with each frame. telemetry: a function that returns the log, as the pipeline expects
+    of a source; None if there is none. clock_offset_s: the offset of the camera's clock, with which `align_log` aligns
+    a log that has a clock. aligned: is called with the aligned log. locator: of the pipeline that runs now; None if
+    nothing is located.
     """
 
     count = None
@@ -54,6 +55,7 @@ class Feed:
         self.telemetry = None if telemetry is None else lambda: self.log
         self.aligned: Callable[[Telemetry], object] = lambda log: None
         self.locator: AerialLocator | None = None
+        self.seen: Callable[[Frame], object] = lambda frame: None
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
@@ -89,6 +91,7 @@ class Feed:
                 # Earlier frames are not missing: the pipeline that failed has seen them.
                 frame, self._first = replace(frame, skipped=frame.number - 1), False
             self.newest = frame
+            self.seen(frame)
             self._read_log(frame)
             self._watchdog.begin(frame.number)
             yield frame

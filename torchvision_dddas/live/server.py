@@ -1,40 +1,58 @@
-"""Serve the state of a live run over HTTP: a page for people, text for Prometheus, JSON for programs."""
+"""Serve a live run over HTTP: the operator's page, text for Prometheus, JSON for programs."""
 
 import json
 import math
+import select
 import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import parse_qs
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output import finite
 from torchvision_dddas.io.report import render_page
 from torchvision_dddas.io.streams import Stream
+from torchvision_dddas.live.access import Access, cookie_name
 from torchvision_dddas.live.health import Health, Snapshot, snapshot_facts
+from torchvision_dddas.live.operator_view import MOST_WATCHERS, PICTURES, OperatorView
 from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"
 
-Page = Callable[[], tuple[int, str, str]]
-"""Returns (status, type, text); called in a server thread."""
+Body = str | Generator[bytes]
+"""A text, or an endless stream of bytes, in which b"" means that there is nothing to send at the moment."""
+
+Page = Callable[[], tuple[int, str, Body]]
+"""Returns (status, type, body); called in a server thread."""
 
 _CLIENT_TIMEOUT_S = 5.0
 _MOST_CLIENTS = 8  # simultaneous clients; a further one disconnects the oldest, so that slow clients cannot block it
 _SHOWN_EVENTS = 20
+_ALARMS = ("zone", "crowd")  # kinds of events that an operator must not miss
+# Allow own files alone, and no code inside a page, so that a stream's name cannot become code.
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; form-action 'self'; "
+    "base-uri 'none'; frame-ancestors 'none'"
+)
+_SENT_BYTES = 65_536  # buffer of a stream: a slow client gets few old pictures
 
 
 class HealthServer:
     """Serves pages while the context is open. address: (host, port) in use. pages: by path; may be filled later."""
 
-    def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
-        """Raise InputError if the port is in use, or if the host is not an address of this machine."""
+    def __init__(self, address: tuple[str, int], pages: dict[str, Page], access: Access | None = None) -> None:
+        """access: who may read the pages; None: no token is needed.
+
+        Raise InputError if the port is in use, or if the host is not an address of this machine.
+        """
+        self.access = access or Access()
         try:
-            self._server = _Server(address, pages)
+            self._server = _Server(address, pages, self.access)
         except OSError as error:
             raise InputError(
                 f"cannot serve at {address[0]}:{address[1]}: {(error.strerror or str(error)).lower()}; "
@@ -50,9 +68,26 @@ class HealthServer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._server.is_closing = True
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+    @property
+    def url(self) -> str:
+        """The address of the page, with the token if it was made here. A wildcard is replaced by an own address."""
+        host, port = self.address
+        host = _own_address() if host in ("0.0.0.0", "::") else host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}/" + (f"?token={self.access.token}" if self.access.is_made else "")
+
+
+def _own_address() -> str:
+    """Return the address of this machine towards other machines; its name if it has none."""
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing; the address is reserved for documentation
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
 
 
 def parse_address(spec: str) -> tuple[str, int]:
@@ -71,8 +106,13 @@ def health_pages(
     name: str,
     version: str,
     patience_s: float,
+    view: OperatorView | None = None,
 ) -> dict[str, Page]:
-    """Return the pages of a run. state_now: returns its state. patience_s: longest time without result that is fine."""
+    """Return the pages of a run. state_now: returns its state. patience_s: longest time without result that is fine.
+
+    view: the source of pictures and targets; None leaves them out.
+    """
+    view = view or OperatorView()
 
     def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
@@ -93,15 +133,36 @@ def health_pages(
         text = json.dumps(finite(facts | snapshot_facts(now)), indent=2) + "\n"
         return (503 if trouble else 200), "application/json", text
 
-    return {"/": page, "/metrics": prometheus, "/health.json": program}
+    def operator() -> tuple[int, str, str]:
+        now, trouble = state()
+        facts = shown_facts(now, name, state_now(), trouble)
+        facts |= {"session": view.session, "idle_s": now.idle_s, **view.facts()}
+        return 200, "application/json", json.dumps(finite(facts))
+
+    def pictures() -> tuple[int, str, Body]:
+        if view.is_full:
+            return 503, "text/plain", f"{MOST_WATCHERS} clients watch the pictures already\n"
+        return 200, PICTURES, view.pictures()
+
+    return {
+        "/": page,
+        "/metrics": prometheus,
+        "/health.json": program,
+        "/state.json": operator,
+        "/zones.json": lambda: (200, "application/json", json.dumps(view.zones())),
+        "/picture.mjpg": pictures,
+        "/live.js": lambda: (200, "text/javascript", render_page("live.js")),
+        "/live.css": lambda: (200, "text/css", render_page("live.css")),
+        "/favicon.ico": lambda: (204, "image/x-icon", ""),
+    }
 
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
-        self.pages = pages
+    def __init__(self, address: tuple[str, int], pages: dict[str, Page], access: Access) -> None:
+        self.pages, self.access, self.is_closing = pages, access, False
         self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
         super().__init__(address, _Handler)
@@ -119,8 +180,12 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            with self._lock, suppress(ValueError):
-                self._clients.remove(request)
+            self.release(request)
+
+    def release(self, request: Any) -> None:
+        """Do not disconnect this client for others any more."""
+        with self._lock, suppress(ValueError):
+            self._clients.remove(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore clients that disconnected."""
@@ -132,18 +197,57 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "dddas", ""
 
     def do_GET(self) -> None:
-        page = self.server.pages.get(self.path.partition("?")[0])
-        status, kind, text = page() if page else (404, "text/plain", f"there are {', '.join(self.server.pages)}\n")
-        body = text.encode()
+        path, _, query = self.path.partition("?")
+        access, port = self.server.access, self.server.server_address[1]
+        if not access.allows(self.headers, query, port):
+            self._refuse(path)
+        elif path == "/" and access.token and "token" in parse_qs(query):
+            # The cookie takes the token out of the address, which histories and logs keep.
+            cookie = f"{cookie_name(port)}={access.token}; HttpOnly; SameSite=Lax; Max-Age=31536000"
+            self._send(303, "text/plain", "", {"Location": "./", "Set-Cookie": cookie})
+        elif page := self.server.pages.get(path):
+            self._send(*page())
+        else:
+            self._send(404, "text/plain", f"there are {', '.join(self.server.pages)}\n")
+
+    def _refuse(self, path: str) -> None:
+        if not self.server.access.token:
+            words = "this run is served to localhost and addresses alone; give it a token with --serve-token\n"
+            self._send(403, "text/plain", words)
+        elif path == "/":
+            self._send(401, "text/html", render_page("token.html"), {"WWW-Authenticate": "Bearer"})
+        else:
+            words = "a token is needed: send Authorization: Bearer TOKEN, or open /?token=TOKEN in a browser\n"
+            self._send(401, "text/plain", words, {"WWW-Authenticate": "Bearer"})
+
+    def _send(self, status: int, kind: str, body: Body, headers: Mapping[str, str] | None = None) -> None:
         self.send_response(status)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Type", f"{kind}; charset=utf-8" if isinstance(body, str) else kind)
+        if isinstance(body, str):
+            self.send_header("Content-Length", str(len(body.encode())))
+        for name, value in (headers or {}).items():
+            self.send_header(name, value)
         self.send_header("Cache-Control", "no-store")
-        # Allow no external content and no script, so that a stream's name cannot become code.
-        self.send_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("Content-Security-Policy", _POLICY)
         self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
+        if self.command == "HEAD":
+            return
+        if isinstance(body, str):
+            self.wfile.write(body.encode())
+        else:
+            self._stream(body)
+
+    def _stream(self, parts: Generator[bytes]) -> None:
+        """Send parts until the client disconnects, reads too slowly, or the server closes."""
+        self.server.release(self.request)  # it lasts, so it is the oldest client soon
+        self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENT_BYTES)
+        with closing(parts):
+            for part in parts:
+                if self.server.is_closing or select.select([self.request], [], [], 0)[0]:  # it sends only its end
+                    return
+                self.wfile.write(part)
 
     do_HEAD = do_GET
 
@@ -186,7 +290,12 @@ _HELP = {name: words for table in (_COUNTS, _GAUGES, _SECONDS) for name, (_, wor
 
 
 def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int = 2) -> str:
-    """Return the page for people, without scripts or external content, reloaded every refresh_s."""
+    """Return the page for people. Its script updates it; without scripts it reloads itself every refresh_s."""
+    return render_page("live.html", refresh_s=refresh_s, **shown_facts(now, name, state, trouble))
+
+
+def shown_facts(now: Snapshot, name: str, state: str, trouble: str) -> dict[str, Any]:
+    """Return what the page shows of the health: figures, and the latest events first."""
 
     def count(name: str) -> str:
         return f"{now.counts.get(name, 0):,}".replace(",", " ")
@@ -206,17 +315,16 @@ def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int
             figures += [(f"{title}, median", f"{1000 * median:.0f} ms"), (f"{title}, 99 %", f"{1000 * most:.0f} ms")]
     figures += [(title, count(key)) for key, (title, _) in _COUNTS.items() if title and key in now.counts]
     figures += [(platform, facts["state"]) for platform, facts in now.platforms.items()]
-    return render_page(
-        "live.html",
-        title=f"{state} · {name}",
-        name=name,
-        trouble=trouble,
-        figures=figures,
-        events=[(_clock(e.utc_s), e.frame, e.text) for e in list(reversed(now.events))[:_SHOWN_EVENTS]],
-        now=_clock(datetime.now(UTC).timestamp()),
-        links=("/metrics", "/health.json"),
-        refresh_s=refresh_s,
-    )
+    # Other events must not push alarms off the page.
+    newest = [e for k, e in enumerate(reversed(now.events)) if k < _SHOWN_EVENTS or e.kind in _ALARMS]
+    return {
+        "title": f"{state} · {name}",
+        "name": name,
+        "trouble": trouble,
+        "figures": figures,
+        "events": [(_clock(e.utc_s), e.frame, e.text, e.kind in _ALARMS, round(e.utc_s, 3)) for e in newest],
+        "now": _clock(datetime.now(UTC).timestamp()),
+    }
 
 
 def _span(seconds: float) -> str:

@@ -29,10 +29,12 @@ from torchvision_dddas.io.output import (
 )
 from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
+from torchvision_dddas.live.access import choose_access
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.commanding import CommandOptions, open_commands
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
 from torchvision_dddas.live.log_alignment import describe_landmarks, describe_log
+from torchvision_dddas.live.operator_view import OperatorView
 from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.runner import (
     Feed,
@@ -47,7 +49,7 @@ from torchvision_dddas.live.server import HealthServer, Page, health_pages, pars
 from torchvision_dddas.live.team import LiveTeam
 from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
-from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, locator_facts
+from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, locator_facts, map_site
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Frame, FrameResult
@@ -80,14 +82,17 @@ def run_live(
     detector: OnnxDetector | None = None,
     movers: bool = False,
     commanding: CommandOptions | None = None,
+    serve_token: str | None = None,
 ) -> int:
     """Run until the pictures end or a signal ends the run, and return the exit code. Write a new folder under out.
 
     SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. wait: wait for an
     absent camera at the start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of
-    its commands. Raise InputError for any other fault at the start; a later fault becomes an event.
+    its commands. serve_token: as `choose_access` takes it. Raise InputError for any other fault at the start; a later
+    fault becomes an event.
     """
     address = None if serve is None else parse_address(serve)
+    access = None if address is None else choose_access(address[0], serve_token)
     if wait and stream_target(clip) is None:
         raise InputError(f"--wait is for a camera or a stream, but {clip} is neither; leave --wait out")
     if backend == "auto":  # the torch engine finishes frames in batches, which would delay live results
@@ -102,12 +107,14 @@ def run_live(
         # Find possible faults before the session has a folder.
         watchdog = Watchdog(health, live.watchdog_s, supervisor)
         name, pages = without_secrets(clip), dict[str, Page]()
-        server = None if address is None else stack.enter_context(HealthServer(address, pages))
+        server = None if address is None else stack.enter_context(HealthServer(address, pages, access))
+        view = OperatorView(partial(health.event, "page"))
+        stack.callback(view.close)
         health.trouble("waiting", _WAITING)
-        pages |= health_pages(health, watchdog, (), lambda: _WAITING, name, VERSION, inf)
+        pages |= health_pages(health, watchdog, (), lambda: _WAITING, name, VERSION, inf, view)
         if wait:  # the service is up, but has no camera yet
             supervisor.say("READY=1", f"STATUS={_WAITING}")
-            if server is not None and not quiet:
+            if server is not None and (not quiet or server.access.is_made):
                 _print_page(server)
         told: list[Event] = []
 
@@ -186,10 +193,14 @@ def run_live(
         status.begin()
         watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
-        pages |= health_pages(health, watchdog, streams, lambda: status.state, name, VERSION, patience_s)
+        pages |= health_pages(health, watchdog, streams, lambda: status.state, name, VERSION, patience_s, view)
 
         feed = Feed(source, health, watchdog, flight)
         feed.clock_offset_s = nan if is_recording else offset_s
+        if server is not None:
+            ground_site = None if ready.watch is None else map_site(ready.watch.locator, None)
+            view.begin(interval, about, ground_site, zones.zones if zones else ())
+            feed.seen = view.take
 
         def stop(number: int) -> None:
             """Take no further picture; the run ends when all taken pictures are finished."""
@@ -207,8 +218,8 @@ def run_live(
             _print("{}, {}x{} at {:g} Hz; into {}".format(source.name, *source.size, source.rate_hz, folder))
             for note in ready.notes:
                 _print(f"note: {note}")
-            if server is not None and not wait:
-                _print_page(server)
+        if server is not None and not wait and (not quiet or server.access.is_made):
+            _print_page(server)
         failure, tally = "", _Located()
         counts = ZoneCounts(zones.zones if zones else ())
         if zones:
@@ -229,6 +240,8 @@ def run_live(
                 about.start_utc_s = source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
                 send_result(result, streams, health)
                 record_result(result, feed, health, live.deadline_ms)
+                if server is not None:
+                    view.show(*result)
             status.state = "complete" if signals.signal is None else "stopped"
         except RepeatedFailure as error:
             failure, status.state = str(error), "failed"
@@ -369,7 +382,7 @@ def _print(text: str) -> None:
 
 
 def _print_page(server: HealthServer) -> None:
-    _print("status page: http://{}:{}/".format(*server.address))
+    _print(f"status page: {server.url}")
 
 
 def _print_event(event: Event) -> None:

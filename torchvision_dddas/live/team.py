@@ -177,7 +177,7 @@ class LiveTeam:
 
     def _read(self, one: Platform) -> None:
         """Locate the pictures of a platform until it ends or fails. Its failure never ends the run."""
-        _give_way()
+        give_way()
         own, looks, over = self._healths[one.name], self._looks[one.name], ""
         try:
             for look in self._see(one):
@@ -242,7 +242,7 @@ class LiveTeam:
 
     def _fuse(self) -> None:
         """Fuse waiting records, and the remaining records at the end. Leave out a record that cannot be fused."""
-        _give_way()
+        give_way()
         is_last = False
         while not is_last:
             with self._changed:
@@ -280,7 +280,7 @@ class LiveTeam:
         return final[-1] if final else None
 
 
-def _give_way() -> None:
+def give_way() -> None:
     """Lower the priority of this thread."""
     if sys.platform == "linux":  # other systems have no priority per thread
         with suppress(OSError):

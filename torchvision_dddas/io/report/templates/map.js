@@ -23,28 +23,15 @@
   tick.type="checkbox";tick.checked=true;tick.style.accentColor=colour;label.append(tick," "+name);get("layers").append(label);
   tick.addEventListener("change",()=>tick.checked?layer.addTo(map):layer.remove());
   return layer;}
- map.createPane("ground").style.zIndex=250;map.getPane("ground").style.pointerEvents="none";
+ groundPane(map);
  map.fitBounds(box(data.box));
  const lines=data.movers.map(m=>({name:m.name,kind:m.kind,colour:m.kind==="camera"?soft:shade(m.colour),parts:m.parts,
   places:m.parts.map(part=>part.map(spot))}));
 
- // Draw the photo and a grid below the tracks. The grid is redrawn when the map moves.
+ // Draw the photo and a grid below the tracks. The lines of the grid follow the map.
  if(data.photo)L.imageOverlay(data.photo.url,box(data.photo.box),{pane:"ground",opacity:dark?.6:.8,alt:"photo of the ground"})
   .addTo(group("photo",soft));
- const grid=group("grid, m",soft);
- function drawGrid(){
-  const seen=map.getBounds(),more=seen.pad(.5),raw=(seen.getEast()-seen.getWest())/map.getSize().x*90;
-  const power=10**Math.floor(Math.log10(raw)),step=[1,2,5,10].map(k=>k*power).find(s=>s>=raw);
-  function line(value,ends,label,anchor,style){
-   L.polyline(ends,{pane:"ground",color:soft,weight:1,opacity:.4,interactive:false}).addTo(grid);
-   if(!seen.contains(label)||style&&value>seen.getNorth()-raw/4)return;
-   const icon=L.divIcon({className:"tick "+style,html:words(String(+value.toFixed(6)).replace("-","\u2212")),iconSize:[60,16],iconAnchor:anchor});
-   L.marker(label,{icon,interactive:false,keyboard:false,pane:"ground",zIndexOffset:9999}).addTo(grid);}
-  grid.clearLayers();
-  for(let e=Math.ceil(more.getWest()/step)*step;e<=more.getEast();e+=step)
-   line(e,[[more.getSouth(),e],[more.getNorth(),e]],[seen.getNorth(),e],[-1,0],"");
-  for(let n=Math.ceil(more.getSouth()/step)*step;n<=more.getNorth();n+=step)
-   line(n,[[n,more.getWest()],[n,more.getEast()]],[n,seen.getEast()],[62,16],"right");}
+ const drawGrid=metreGrid(map,group("grid, m",soft),soft,words);
  map.on("moveend resize",drawGrid);
 
  // Draw zones, looks of ground vehicles, and events.
