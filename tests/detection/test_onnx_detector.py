@@ -16,6 +16,19 @@ BOX = [60, 40, 80, 20]
 NAMES = {"names": "{0: 'car', 1: 'person', 2: 'bus'}", "task": "detect"}
 
 
+def _write_constant(path, outputs, metadata=None):
+    """Write a network with these outputs for every picture."""
+    constants = [onnx.numpy_helper.from_array(values, f"{name}_given") for name, values in outputs.items()]
+    nodes = [helper.make_node("Identity", [f"{name}_given"], [name]) for name in outputs]
+    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, values.shape) for name, values in outputs.items()]
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, SIDE, SIDE])
+    graph = helper.make_graph(nodes, "constant", [images], given, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    helper.set_model_props(model, metadata or {})
+    onnx.save(model, path)
+    return path
+
+
 @pytest.fixture
 def picture():
     """A red rectangle on black, twice as wide as high, so that a letterbox has bars."""
@@ -35,6 +48,15 @@ def test_every_layout_is_told_and_finds_the_same_box(layout, picture, tmp_path):
     assert found.label.tolist() == ["1"] and found.class_id.tolist() == [1]
     assert any("names no classes" in note for note in detect.notes)
     assert layout == "YOLOX" or not len(detect(np.zeros_like(picture)))
+
+
+def test_boxes_with_exactly_the_lowest_score_are_kept_once(tmp_path):
+    table = np.zeros((1, 7, 336), np.float32)
+    table[0, :4] = [[64], [64], [8], [8]]
+    table[0, 4, :3] = 0.25
+    detect = OnnxDetector(_write_constant(tmp_path / "model.onnx", {"output0": table}), score=0.25)
+    found = detect(np.zeros((SIDE, SIDE, 3), np.uint8))
+    assert found.score.tolist() == [0.25]
 
 
 def test_half_precision_and_free_sizes_find_the_same(picture, tmp_path):

@@ -91,7 +91,9 @@ class OnnxDetector:
         rows = np.flatnonzero(keep)[np.argsort(-score[keep], kind="stable")][:_MOST_BOXES]
         box = np.concatenate([corners[rows, :2], corners[rows, 2:] - corners[rows, :2]], axis=1)
         if self.layout.overlap < 1 and len(rows):
-            best = cv2.dnn.NMSBoxesBatched(box, score[rows], number[rows], self._score, self.layout.overlap)  # type: ignore[arg-type]
+            # OpenCV drops scores that equal its threshold, and returns () for no box, which would select every row.
+            found_best = cv2.dnn.NMSBoxesBatched(box, score[rows], number[rows], 0.0, self.layout.overlap)  # type: ignore[arg-type]
+            best = np.array(found_best, np.intp).ravel()
             rows, box = rows[best], box[best]
         score, number = np.clip(score[rows], 0, 1), number[rows]
         label = np.array([self.names.get(k, str(k)) for k in number.tolist()], object)
