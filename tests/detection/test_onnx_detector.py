@@ -59,6 +59,26 @@ def test_boxes_with_exactly_the_lowest_score_are_kept_once(tmp_path):
     assert found.score.tolist() == [0.25]
 
 
+def test_coefficients_of_masks_are_no_classes(tmp_path):
+    table = np.zeros((1, 4 + 3 + 32, 336), np.float32)
+    table[0, :4] = [[64], [64], [8], [8]]
+    table[0, 5, 0], table[0, 7:] = 0.9, 5.0
+    outputs = {"output0": table, "output1": np.zeros((1, 32, 32, 32), np.float32)}
+    detect = OnnxDetector(_write_constant(tmp_path / "model.onnx", outputs), classes=["car", "person", "bus"])
+    found = detect(np.zeros((SIDE, SIDE, 3), np.uint8))
+    assert (detect.layout.classes, found.label.tolist(), found.score.round(2).tolist()) == (3, ["person"], [0.9])
+
+
+def test_classes_beyond_the_names_are_found_and_noted(tmp_path):
+    table = np.zeros((1, 7, 336), np.float32)
+    table[0, :4] = [[64], [64], [8], [8]]
+    table[0, 6, 0] = 0.9
+    metadata = {"names": "{0: 'car', 1: 'person'}", "task": "detect"}
+    detect = OnnxDetector(_write_constant(tmp_path / "model.onnx", {"output0": table}, metadata))
+    assert detect(np.zeros((SIDE, SIDE, 3), np.uint8)).label.tolist() == ["2"]
+    assert detect.notes == ["model.onnx names 2 of 3 classes; others are numbers"]
+
+
 def test_half_precision_and_free_sizes_find_the_same(picture, tmp_path):
     half = OnnxDetector(write_finder(tmp_path / "half.onnx", "YOLOv8", half=True))
     np.testing.assert_allclose(half(picture).box_px, [BOX], atol=2.5)

@@ -131,7 +131,13 @@ class OnnxDetector:
         kind = beside.get("model_type")
         softmax = None if kind is None else kind in ("detr", "yolos", "table-transformer")
         is_final = "orig_target_sizes" in self._inputs
-        layout = tell_layout(self._run(blank), self.size_px, is_final, len(self.names), softmax)
+        # Only classes follow the boxes of a network for `detect`. A list of names that is too short must not hide any.
+        names = 0 if metadata.get("task") == "detect" else len(self.names)
+        layout = tell_layout(self._run(blank), self.size_px, is_final, names, softmax)
+        if self.names and layout.classes > len(self.names):
+            self.notes.append(
+                f"{self.path.name} names {len(self.names)} of {layout.classes} classes; others are numbers"
+            )
         if "pred_boxes" not in self._outputs:
             return layout
         if kind is None:

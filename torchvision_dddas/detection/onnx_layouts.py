@@ -79,7 +79,8 @@ def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, so
     if len(shapes.get("labels", ())) == 3 and shapes.get("dets", ())[2:] == (4,):
         return Layout("RF-DETR", partial(_decode_queries, "labels", "dets", False), mean=_MEAN, spread=_SPREAD)
     tables = [name for name, shape in shapes.items() if len(shape) == 3 and shape[0] == 1]
-    if len(tables) == 1 and (layout := _tell_yolo(tables[0], outputs[tables[0]], size, names)) is not None:
+    masks = sum(shape[1] for shape in shapes.values() if len(shape) == 4)
+    if len(tables) == 1 and (layout := _tell_yolo(tables[0], outputs[tables[0]], size, names, masks)) is not None:
         return layout
     shown = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
     raise InputError(
@@ -88,12 +89,16 @@ def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, so
     )
 
 
-def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int) -> Layout | None:
-    """Return the layout of a single table. names: number of classes; it tells classes from masks and keypoints."""
+def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int, masks: int) -> Layout | None:
+    """Return the layout of a single table. names: number of classes; it tells classes from keypoints.
+
+    masks: number of coefficients of masks, which follow the classes; 0 for a network without masks.
+    """
     _, rows, columns = table.shape
     cells = [sum((size[0] // s) * (size[1] // s) for s in strides) for strides in _STRIDES]
     is_turned = columns in cells and rows > 4
     classes = rows - 4 if is_turned else columns - 5
+    classes -= masks if masks < classes else 0
     classes = names if 0 < names < classes else classes
     if is_turned:
         return Layout("YOLOv8", lambda given, _: _best(given[key][0].T, 4, classes), classes, "centre", 0.7)
