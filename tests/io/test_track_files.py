@@ -95,6 +95,16 @@ def test_results_of_a_detector_in_cocos_format_are_read(tmp_path):
     assert (read.frame[0], read.box_px[0].tolist(), read.label[0], read.identity[0]) == (3, [1, 2, 3, 4], "2", -1)
 
 
+def test_what_is_left_out_of_other_formats_is_noted(tmp_path):
+    boxes = [{"image_id": 1, "bbox": [9, 9, 5, 5], "iscrowd": crowd} for crowd in (0, 1)]
+    (tmp_path / "a.json").write_text(json.dumps(boxes))
+    read: Any = read_detections(tmp_path / "a.json")
+    assert len(read) == 1 and read.notes == ("1 boxes of crowds (iscrowd) are left out",)
+    regions = "<ignored_region><box left='0' top='0' width='9' height='9'/></ignored_region></sequence>"
+    (tmp_path / "a.xml").write_text(DETRAC.replace("</sequence>", regions))
+    assert read_detections(tmp_path / "a.xml").notes == ("1 ignored regions of UA-DETRAC are left out",)
+
+
 BDD = [
     {"videoName": "v", "frameIndex": 0, "labels": []},
     {

@@ -48,14 +48,16 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
         if not files or any(file.suffix == ".txt" for file in path.iterdir()):
             return None
         return _cells(path, _read_masks(files, pictures))
-    readers: dict[str, Callable[[bytes, Sequence[str]], Iterable[Row]]] = {".json": _read_json, ".xml": _read_xml}
+    said: list[str] = []
+    readers: dict[str, Callable[[bytes, Sequence[str], list[str]], Iterable[Row]]] = {".json": _read_json, ".xml": _read_xml}
     if (reader := readers.get(path.suffix.lower())) is None:
         return None
     try:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"detections {path} cannot be read: {error.strerror}") from None
-    return _cells(path, reader(content, pictures))
+    text, notes = _cells(path, reader(content, pictures, said))
+    return text, said + notes
 
 
 def name_columns(path: Path, text: CsvText) -> tuple[CsvText, list[str]] | None:
@@ -136,16 +138,17 @@ def frames_of(names: Sequence[str], pictures: Sequence[str]) -> list[int]:
     return [number + (min(numbers) == 0) for number in numbers]
 
 
-def _read_json(content: bytes, pictures: Sequence[str]) -> Iterator[Row]:
+def _read_json(content: bytes, pictures: Sequence[str], said: list[str]) -> Iterator[Row]:
+    """Read COCO or BDD100K. said: takes notes on what is left out or assumed."""
     data = json.loads(content)
     frames = data.get("frames") if isinstance(data, dict) else data
     if isinstance(frames, list) and any("labels" in frame for frame in frames):
         yield from _read_bdd(frames)
     else:
-        yield from _read_coco(data if isinstance(data, dict) else {"annotations": data}, pictures)
+        yield from _read_coco(data if isinstance(data, dict) else {"annotations": data}, pictures, said)
 
 
-def _read_coco(data: dict[str, Any], pictures: Sequence[str]) -> Iterator[Row]:
+def _read_coco(data: dict[str, Any], pictures: Sequence[str], said: list[str]) -> Iterator[Row]:
     """Read COCO's detections (a list), or annotations. `track_id` or `instance_id` is the identity, if given.
 
     Source: cocodataset.org, data format and results format; TAO and CocoVID for tracks.
@@ -160,6 +163,8 @@ def _read_coco(data: dict[str, Any], pictures: Sequence[str]) -> Iterator[Row]:
         numbers = frames_of([str(image["file_name"]) for image in images], pictures)
     frames = {image["id"]: number for image, number in zip(images, numbers, strict=True)}
     names = {category["id"]: category["name"] for category in data.get("categories", [])}
+    if crowds := sum(bool(box.get("iscrowd")) for box in data["annotations"]):
+        said.append(f"{crowds} boxes of crowds (iscrowd) are left out")
     for box in data["annotations"]:
         if box.get("iscrowd"):
             continue
@@ -186,8 +191,10 @@ def _read_bdd(frames: list[dict[str, Any]]) -> Iterator[Row]:
                 yield number + 1, target["id"], *place, target.get("score"), None, target.get("category")
 
 
-def _read_xml(content: bytes, pictures: Sequence[str]) -> Iterator[Row]:
+def _read_xml(content: bytes, pictures: Sequence[str], said: list[str]) -> Iterator[Row]:
     root = ElementTree.fromstring(content)
+    if regions := sum(len(ignored) for ignored in root.iter("ignored_region")):
+        said.append(f"{regions} ignored regions of UA-DETRAC are left out")
     if root.tag not in ("sequence", "annotations"):
         raise ValueError(f"the XML begins with <{root.tag}>; wanted <annotations> of CVAT or <sequence> of UA-DETRAC")
     yield from _read_detrac(root) if root.tag == "sequence" else _read_cvat(root, pictures)
