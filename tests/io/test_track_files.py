@@ -88,6 +88,11 @@ def test_coco_has_the_names_and_the_size_of_the_pictures(tmp_path):
     assert read_detections(tmp_path / "a.json").frame.max() == 6
 
 
+def test_coco_keeps_the_frames_of_pictures_that_are_numbered_otherwise(tmp_path):
+    write_tracks(tracks(), tmp_path / "a.json", size=SIZE, pictures=[f"clip_{k}.jpg" for k in range(100, 106)])
+    assert np.unique(read_detections(tmp_path / "a.json").frame).tolist() == [1, 2, 3, 6]
+
+
 def test_results_of_a_detector_in_cocos_format_are_read(tmp_path):
     box = {"image_id": 3, "category_id": 2, "bbox": [1, 2, 3, 4], "score": 0.5}
     (tmp_path / "a.json").write_text(json.dumps([box]))

@@ -200,7 +200,8 @@ def _write_coco(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
         item["area"] = round(box[2] * box[3], 2)
         boxes.append(item | ({"track_id": int(table.identity[row])} if table.identity[row] > 0 else {}))
     frames = sorted({*range(1, len(names) + 1), *_frames(table).tolist()})
-    images = [{"id": frame, "file_name": _picture(frame, names), **shape} for frame in frames]
+    # The number at the end of a picture's name need not be its place in the clip.
+    images = [{"id": frame, "frame_id": frame, "file_name": _picture(frame, names), **shape} for frame in frames]
     categories = [{"id": number, "name": name} for number, name in kinds.items()]
     save_file(path, json.dumps({"images": images, "annotations": boxes, "categories": categories}).encode())
     return [] if shape else ["the images have no width and height, because the clip was not given"]
