@@ -93,6 +93,20 @@ def test_coco_keeps_the_frames_of_pictures_that_are_numbered_otherwise(tmp_path)
     assert np.unique(read_detections(tmp_path / "a.json").frame).tolist() == [1, 2, 3, 6]
 
 
+@pytest.mark.parametrize(("to", "file"), [("yolo", "000003.txt"), ("davis", "000003.png")])
+def test_files_of_other_boxes_are_not_left_beside_new_ones(to, file, tmp_path):
+    write_tracks(tracks(), tmp_path, to=to, size=SIZE)
+    write_tracks(tracks(), tmp_path, to=to, size=SIZE)
+    with pytest.raises(InputError, match=f"holds {file}, which is not of these boxes"):
+        write_tracks(tracks(frames=(1, 2)), tmp_path, to=to, size=SIZE)
+
+
+def test_a_table_without_tracks_becomes_empty_masks(tmp_path):
+    (tmp_path / "a.csv").write_text("frame,identity,x_px,y_px,width_px,height_px\n")
+    write_tracks(read_detections(tmp_path / "a.csv"), tmp_path, to="davis", size=SIZE, pictures=["a.png"])
+    assert [file.name for file in (tmp_path / "masks").iterdir()] == ["000001.png"]
+
+
 def test_results_of_a_detector_in_cocos_format_are_read(tmp_path):
     box = {"image_id": 3, "category_id": 2, "bbox": [1, 2, 3, 4], "score": 0.5}
     (tmp_path / "a.json").write_text(json.dumps([box]))

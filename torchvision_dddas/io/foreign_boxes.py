@@ -26,6 +26,7 @@ COLUMNS = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score"
 """The columns of a Row. An unknown value is None."""
 
 Row = tuple[Any, ...]
+_Reader = Callable[[bytes, Sequence[str], list[str]], Iterable[Row]]
 
 
 class BoxText(CsvText):
@@ -49,7 +50,7 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
             return None
         return _cells(path, _read_masks(files, pictures))
     said: list[str] = []
-    readers: dict[str, Callable[[bytes, Sequence[str], list[str]], Iterable[Row]]] = {".json": _read_json, ".xml": _read_xml}
+    readers: dict[str, _Reader] = {".json": _read_json, ".xml": _read_xml}
     if (reader := readers.get(path.suffix.lower())) is None:
         return None
     try:

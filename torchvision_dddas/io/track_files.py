@@ -222,12 +222,20 @@ def _write_yolo(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
         cells = [f"{number[row]}", *(f"{share:.6f}" for share in shares[row])]
         cells += [f"{table.score[row]:.6g}"] if (table.score != 1).any() else []
         lines.setdefault(_frames(table)[row], []).append(" ".join(cells))
+    files = {frame: Path(_picture(frame, names)).with_suffix(".txt").name for frame in lines}
+    _refuse_others(path, {*files.values(), "classes.txt"}, "*.txt")
     for frame, texts in lines.items():
-        save_file(path / Path(_picture(frame, names)).with_suffix(".txt").name, ("\n".join(texts) + "\n").encode())
+        save_file(path / files[frame], ("\n".join(texts) + "\n").encode())
     words = [kinds.get(k, str(k)) for k in range(max(kinds, default=-1) + 1)]
     save_file(path / "classes.txt", ("\n".join(words) + "\n").encode())
     is_cut = (high - low < table.box_px[:, 2:] - 1e-6).any(axis=1)
     return [f"{is_cut.sum()} boxes go beyond the picture: they are cut, or left out"] if is_cut.any() else []
+
+
+def _refuse_others(folder: Path, names: set[str], pattern: str) -> None:
+    """Raise InputError if a folder holds further files, which a reader would take for files of this table."""
+    if others := sorted({file.name for file in folder.glob(pattern)} - names):
+        raise InputError(f"{folder} holds {others[0]}, which is not of these boxes; give an empty folder, or remove it")
 
 
 def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
@@ -264,13 +272,15 @@ def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
 def _write_davis(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
     """Write masks/000001.png and so on. The values of the masks are identities."""
     assert size is not None
-    if (most := int(table.identity.max())) > _MOST_VALUES:
+    if (most := int(table.identity.max(initial=0))) > _MOST_VALUES:
         raise InputError(f"identity {most} is above {_MOST_VALUES}, the largest value of a mask")
+    masks, frames = Masks(path), _frames(table)
+    count = max(int(frames.max(initial=0)), len(names))
+    _refuse_others(path / "masks", {f"{frame:06d}.png" for frame in range(1, count + 1)}, "*.png")
     path.mkdir(parents=True, exist_ok=True)
-    masks, frames = Masks(path), table.frame
     edges = np.c_[table.box_px[:, :2], table.box_px[:, :2] + table.box_px[:, 2:]].round()
     edges = np.clip(edges, 0, [*size, *size]).astype(int)
-    for frame in range(1, max(int(np.max(frames)), len(names)) + 1):
+    for frame in range(1, count + 1):
         mask = np.zeros(size[::-1], np.uint16)
         for row in np.flatnonzero(frames == frame).tolist():
             left, top, right, bottom = edges[row]
