@@ -250,8 +250,10 @@ def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
         *(f"<label><name>{xml_text(name)}</name></label>" for name in labels),
         f"</labels>{shape}</task></meta>",
     ]
+    changed = 0
     for identity in np.unique(table.identity).tolist():
         rows = np.flatnonzero(table.identity == identity)
+        changed += len({name for name in table.label[rows] if name}) > 1
         rows = rows[np.argsort(_frames(table)[rows], kind="stable")]
         name = next((name for name in table.label[rows] if name), "target")
         lines.append(f'<track id="{identity}" label="{xml_text(name)}">')
@@ -266,7 +268,7 @@ def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
             ]
         lines.append("</track>")
     save_file(path, ("\n".join([*lines, "</annotations>"]) + "\n").encode())
-    return []
+    return [f"{changed} tracks change their class: cvat holds one, the first"] if changed else []
 
 
 def _write_davis(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
