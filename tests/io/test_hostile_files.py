@@ -403,9 +403,9 @@ def test_a_classifier_whose_parts_lie_deep_in_each_other_is_refused_before_openc
     ("part", "words"),
     [
         ("   SVMDetector: [ {} ]\n", "has 300001 numbers; a descriptor of these settings has 3780"),
-        ("   winSize: [ {} ]\n   SVMDetector: [ 1. ]\n", "its parts do not fit"),
+        ("   winSize: [ {} ]\n   SVMDetector: [ 1. ]\n", "its parts do not fit together"),
         (SVM.format("[ {} ]", "[ { alpha: [ 1 ], rho: 1 } ]"), "has 300,001 support vectors"),
-        (SVM.format("[ [ 1 ] ]", "[ { alpha: [ {} ], rho: 1 } ]"), "its parts do not fit"),
+        (SVM.format("[ [ 1 ] ]", "[ { alpha: [ {} ], rho: 1 } ]"), "its parts do not fit together"),
     ],
 )
 def test_a_classifier_of_too_many_numbers_is_refused_by_their_count(tmp_path, part, words):

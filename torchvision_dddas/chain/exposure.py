@@ -6,12 +6,12 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-# The quantiles of the grey levels that are compared. Camera motion changes them little, and unlike a gain.
+# The quantiles of the grey levels that are compared. Camera motion changes them little, and not as a gain would.
 _SHARES = np.linspace(0.02, 0.98, 33)
 _EDGES = np.arange(257) - 0.5  # edges of the histogram's bins
 # Quantiles nearer to black or white than this may be clipped, and are not used.
 _CLIPPED = 3.0
-# A smaller median difference of the quantiles does not disturb Lucas-Kanade: 2 % of gain on a usual picture.
+# A smaller median difference of the quantiles, about 2 % of gain on a usual picture, does not disturb Lucas-Kanade.
 _MIN_DIFFERENCE = 2.0
 # The fit of gain and offset must reduce the median difference to this share; otherwise the content has changed.
 _MAX_LEFT = 0.5

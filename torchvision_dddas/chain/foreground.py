@@ -98,7 +98,7 @@ class DetectionChain(Generic[View, Picture, Seen]):
         operations: Operations[View, Picture, Seen],
         values: Mapping[str, Number] | None = None,
     ) -> None:
-        """Set up the chain. values: numbers or tensors by parameter name, which replace those of the settings."""
+        """Set up the chain. values: numbers or tensors by parameter name, which replace the settings' values."""
         self.settings, self.operations, self.values = settings, operations, values or {}
         self.is_normalized = settings.difference.kind == "normalized"
 

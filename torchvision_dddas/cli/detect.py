@@ -112,7 +112,7 @@ def detect_clip(
         record = output.begin(facts, source.rate_hz)
         record.notes += [*notes, *(network.notes if network is not None else ())]
         if network is not None and not movers:
-            record.scale = None  # it is that of the search for what moves
+            record.scale = None  # the scale belongs to the search for movers
         found = find_scenes(source, settings, engine, flight, network, movers)
         scenes = note_uncovered(found, flight, record.notes)
         record_results(output, record, scenes, source.name, source.count, quiet, source)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.lab.evaluation.studies.records import Results, Spec
 
-MOST_NOTES, MOST_CLIPS = 12, 20  # notes and clips shown of a study; of more clips, the worst are shown
+MOST_NOTES, MOST_CLIPS = 12, 20  # largest numbers of notes, and of the worst clips, that are shown
 
 
 class Ignored(StrEnum):
@@ -264,7 +264,7 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
 
     columns, title = GROUPS[group].columns, GROUPS[group].title
 
-    def rank(name: str) -> float:  # lowest for the worst clip
+    def rank(name: str) -> float:  # the worst clip has the lowest rank
         value = clips[name][group][columns[0]]
         if value is None or math.isnan(value):
             return math.inf

@@ -122,7 +122,7 @@ def track(
         record = output.begin(facts, rate_hz / interval, size)
         record.notes += notes
         if network is not None and not movers:
-            record.scale = None  # it is that of the search for what moves
+            record.scale = None  # the scale belongs to the search for movers
         last = source.count if source is not None else table.last if table is not None else None
         record_results(
             output,

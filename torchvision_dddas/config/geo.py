@@ -46,7 +46,7 @@ class LandmarkParameters(Group):
     )
     centre: Literal["motion", "colour"] = parameter(
         "motion",
-        "position of a landmark with a blob: the blob's centre, or that of the colour in the middle of the vehicle",
+        "position of a landmark with a blob: the centre of the blob, or of the colour in the middle of the vehicle",
     )
     reach_px: float = parameter(40.0, "largest distance between a landmark's colour and its blob", "px", 0, 10000)
     interval_frames: int = parameter(
@@ -143,7 +143,7 @@ class AerialParameters(Group):
         "", "time zone of a log with local times: a name, Europe/Berlin, or hours from UTC, +02:00"
     )
     order: Literal["auto", "lat-lon", "lon-lat"] = parameter(
-        "auto", "order of two coordinates in one field of a log, GPS(48.1, 11.5); auto: that of its program"
+        "auto", "order of two coordinates in one field of a log, GPS(48.1, 11.5); auto: the order of its program"
     )
 
 

@@ -33,7 +33,7 @@ from torchvision_dddas.errors import InputError
 
 
 class Settings(Group):
-    """All parameters, by group; `help(td.Settings().difference)` describes those of a group.
+    """All parameters, by group; `help(td.Settings().difference)` describes one group.
 
     Settings do not change: `td.load_settings` makes others.
 

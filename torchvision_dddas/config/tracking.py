@@ -78,7 +78,7 @@ class PaperParameters(Group):
     gated: Literal["features", "affinity"] = parameter(
         "features", "gate location and appearance, or their weighted sum"
     )
-    threshold: float = parameter(0.4, "dummy entries are raised if all real ones are below 1 - threshold", "-", 0, 1)
+    threshold: float = parameter(0.4, "dummy entries are raised if all real entries are below 1 - threshold", "-", 0, 1)
     dummy: Literal["zero", "formula", "real_pair"] = parameter(
         "formula",
         "affinity with a dummy before the gate. formula: eq. 4 and 5 with a zero vector; zero: as the text says; "

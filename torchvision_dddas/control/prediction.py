@@ -32,8 +32,8 @@ class Prediction(Table):
 
     target: (N,) int64 identities. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of the box on the
     ground. probability: (N,) that the target is human. unseen: (N,) bool, no ground vehicle has observed it. wanted:
-    (N,) bool, the target is to be followed. lost_s: (N,) time of the located frame minus that of the target's last
-    location from the air. missed: (N,) number of latest frames without the target. steady: (N,) bool, its velocity is
+    (N,) bool, the target is to be followed. lost_s: (N,) time from the target's last location from the air
+    to the located frame. missed: (N,) number of latest frames without the target. steady: (N,) bool, its velocity is
     known. by_ground: (N,) bool, it was seen last from the ground and not from the air.
     """
 

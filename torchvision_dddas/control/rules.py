@@ -33,7 +33,7 @@ def every_wanted(
 ) -> tuple[float, str]:
     """Return k, so that one of k frames should be processed, before rounding and bounds, and its limit in words.
 
-    interval: detection interval from the rule, before its bounds; k is sampling_share of it. speed_m_s, size_m: (N,) of
+    interval: the rule's detection interval before its bounds; k = sampling_share * interval. speed_m_s, size_m: (N,) of
     the known targets. k is limited so that no target moves by more than half its size between two processed frames.
     Its two positions then overlap by half, and are nearer to each other than to any other target. Without a known
     target, k is limited by the motion of a walker who enters the picture. The text is "" if only the rule limits k.

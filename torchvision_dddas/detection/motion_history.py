@@ -93,7 +93,7 @@ def motion_gradient(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the direction of motion (radians, 0 = right, pi/2 = down) and where it is valid, (H, W) each.
 
-    The direction is that of the Sobel gradient over aperture x aperture px (odd). It is valid where the stamps in the
+    The direction follows the Sobel gradient over aperture x aperture px (odd). It is valid where the stamps in the
     aperture span at least delta_min_frames and at most delta_max_frames. OpenCV's calcMotionGradient, which the source
     used, has the same rule.
     """

@@ -172,7 +172,7 @@ class TorchEngine(Engine[TensorView]):
         ]
 
     def _keypoints(self, view: TensorView) -> tuple[Tensor, Tensor]:
-        """Return the view's keypoints and which of them are valid, and cache them in the view."""
+        """Return the view's keypoints and whether each is valid, and cache both in the view."""
         if view.keypoints is None:
             points, valid = self.segmenter.registration.keypoints(self._levels(view))
             if (ignored := self._ignored(view)) is not None:

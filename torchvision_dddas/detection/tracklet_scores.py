@@ -104,7 +104,7 @@ def score_tracklets(
 def choose(
     candidates: Candidates, scores: np.ndarray, accept: float, close_px: float, worth: Worth = BLOB
 ) -> list[int]:
-    """Return the indices of the candidates that are targets, the likeliest first, only one of those that overlap.
+    """Return the indices of the candidates that are targets, the likeliest first, only one of overlapping candidates.
 
     scores: (N,) log odds. accept: lowest score of a target. close_px: side of the closing that made the blobs. A blob
     that joins several targets is replaced by them. A wide blob with nearly the same box as a chosen candidate replaces

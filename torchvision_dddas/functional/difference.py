@@ -45,7 +45,7 @@ def fit_exposure(
         fitted, one = spread > 1e-6, torch.ones_like(spread)
         slope = torch.where(fitted, together / torch.where(fitted, spread, one), one)
         shift = wanted_mean - slope * given_mean
-        # White is 85 x floor; no level moves by more than this.
+        # White is 85 x floor. `moved` bounds the change of every level.
         moved = (85 * floor * (slope - gain).abs() + (shift - offset).abs()).detach()
         gain, offset = torch.where(settled, gain, slope), torch.where(settled, offset, shift)
         settled = settled | (moved < floor / 30)

@@ -55,7 +55,7 @@ def lucas_kanade(
     reach_px: int = 4,
     rounds: int = 1,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """Return the points' places in the second frame, and which were found.
+    """Return the points' places in the second frame, and whether each was found.
 
     guess: predicted places; by default the points' own. Tables reach reach_px around the start of a level. If a point
     leaves its table, a new table is made, up to `rounds` tables in all. With a good guess a reach of 2 suffices. A

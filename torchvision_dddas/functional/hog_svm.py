@@ -30,8 +30,8 @@ SOFT_FIRST, SOFT_SECOND = 0.1, 1e-3
 class Layout:
     """The layout of a descriptor; lengths in pixels.
 
-    window: (width, height). cell and block are squares. stride: step from block to block. bins: over half a turn, or
-    over a whole turn if signed. clip: limit of the values in L2-Hys. gamma: whether to take square roots of the levels.
+    window: (width, height). cell, block: side of a square. stride: step from block to block. bins: number of directions
+    in half a turn, or in a whole turn if signed. clip: limit of the values in L2-Hys. gamma: take roots of the levels.
     Raise InputError if cells do not fill the block, or blocks do not fill the window.
 
     >>> F.Layout().window, F.Layout(window=(32, 64)).window

@@ -92,7 +92,7 @@ def frame_features(
     block: int = 3,
     least: float = 1e-7,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """Return the best `count` corners of the whole frame, best first, and which exist: cv2.goodFeaturesToTrack.
+    """Return the best `count` corners of the frame, best first, and whether each exists, as cv2.goodFeaturesToTrack.
 
     A corner is a local maximum (3 x 3) above quality times the frame's maximum and above `least`, not in the frame's
     outermost pixels. A corner is left out if it is nearer than min_distance_px to a better corner that is kept. Only

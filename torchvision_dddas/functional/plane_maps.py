@@ -81,7 +81,7 @@ def three_point(
 def find_homography(
     points1: Float[Tensor, "B N 2"], points2: Float[Tensor, "B N 2"], weights: Float[Tensor, "B N"] | None = None
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """Return the homographies from points1 to points2, as in Kornia, and which are valid.
+    """Return the homographies from points1 to points2, as in Kornia, and whether each is valid.
 
     Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination. A pair
     of weight 0 has no effect, whatever its values. Four pairs are met exactly. valid is False with fewer than four

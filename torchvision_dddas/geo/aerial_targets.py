@@ -135,7 +135,7 @@ def remove_shadow(
 class TargetSpeeds:
     """Velocities of targets over the ground: one constant-velocity Kalman filter each, driven by white acceleration.
 
-    The measurement noise is that of the pixel. The error of the camera's pose is common to all targets of a frame. If
+    The measurement noise is the pixel's error. The error of the camera's pose is common to all targets of a frame. If
     that error changes between frames, as it does when a log is late and the camera turns, `carry` removes the change.
     """
 

@@ -99,7 +99,7 @@ def find_clock_offset(
     log_s: Float[np.ndarray, "M"],
     logged_rad: Float[np.ndarray, "M 3"],
 ) -> tuple[float, float] | None:
-    """Return the time in seconds to add to a log so that its turns match those of the clip, and its standard deviation.
+    """Return the time in seconds to add to a log so that its turns match the clip's turns, and its standard deviation.
 
     turned_rad, logged_rad: turns from the frame or sample before, in the same axes, NaN if unknown. Return None if no
     offset stands out, for example if the camera does not turn, or turns periodically.
@@ -142,7 +142,7 @@ def find_clock_offset(
 
 
 def _fit(logged: np.ndarray, seen: np.ndarray, least: float) -> tuple[float, np.ndarray]:
-    """Return the likelihood of the turns of a log (N, 3), given those of a clip (N, 3), and their scale (3,).
+    """Return the likelihood of a log's turns (N, 3), given a clip's turns (N, 3), and the scale between them (3,).
 
     The likelihood is a logarithm for one turn, with normal residuals of unknown variance in each axis. least: with
     fewer common turns the likelihood is 0.

@@ -26,8 +26,8 @@ OFFSETS = ("heading", "pitch", "roll", "east", "north", "height", "focal length"
 PART_OF_OFFSET = np.array([1, 0, 0, 2, 2, 3])
 # The part of each of a pose's seven parameters, in the order of Fix; all pictures share one focal length (-1).
 _PART = np.array([0, 0, 1, 2, 2, 3, -1])
-# The prior standard deviation of an offset is _BROAD times that of its part. A standard deviation counts as known to
-# the share _KNOWN of itself, and an offset to the share _KNOWN of the stated standard deviation.
+# An offset's prior standard deviation is _BROAD times its part's. A standard deviation is known if its relative error
+# is below _KNOWN, and an offset if its error is at most the share _KNOWN of the stated standard deviation.
 _BROAD, _KNOWN = 3.0, 0.5
 _LEAST_PICTURES = 6
 # Most points, to limit the time; most steps; length of the last step, in sigmas; largest share of points left out.

@@ -36,7 +36,7 @@ class TargetFusion:
     ) -> None:
         """delay_s: overrides `fusion.delay_s`; 0 if measurements arrive in order.
 
-        origin_deg: longitude and latitude of the local metres of results; None: those of the first measurement.
+        origin_deg: longitude and latitude of the local metres of results; None: taken from the first measurement.
         Raise InputError for a delay below 0.
         """
         self.settings = check_settings(settings)

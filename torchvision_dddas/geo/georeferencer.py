@@ -3,7 +3,7 @@
 The errors of the telemetry and of the landmarks' receivers change slowly, so many frames estimate them. Each error is
 an Ornstein-Uhlenbeck process plus noise. Process and noise together have the stated standard deviation of the error;
 the process decays with a time constant. The first frame is therefore solved like a single picture. Later frames gain
-from independent errors only, those of pixels and motion. No result becomes more certain than the slow errors allow.
+from independent errors only: errors of pixels and motion. No result becomes more certain than the slow errors allow.
 """
 
 from collections.abc import Iterator
@@ -54,9 +54,9 @@ _MOST_EVIDENCE = 15.0
 # Solve a frame again, _AGAIN times at most, while its landmark errors are more than _MORE times the assumed ones.
 _MORE, _AGAIN = 1.1, 4
 _POSE_PARTS = np.array(["heading", "heading", "heading", "place", "place", "altitude", "focal length"])
-# Keys of these parts in a camera's file.
+# Key of each part of the pose in a camera's file.
 _KEYS = {"heading": "heading_deg", "altitude": "height_m or takeoff_above_sea_m", "pitch": "pitch_deg"}
-# Columns of these parts in a table of telemetry.
+# Columns of each part of the pose in a table of telemetry.
 _COLUMNS = {"heading": "heading_deg", "pitch": "pitch_deg", "altitude": "altitude_m", "focal length": "hfov_deg"}
 _COLUMNS |= {"place": "longitude_deg,latitude_deg"}
 

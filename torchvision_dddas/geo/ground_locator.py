@@ -127,7 +127,7 @@ class GroundLocator:
     def place_tables(self, tables: Sequence[DetectionTable]) -> list[CameraView]:
         """Locate the people of each table by its own camera alone.
 
-        Local metres are those of the cameras, or east and north of the first place of the first camera.
+        Local metres are the cameras' metres, or east and north of the first place of the first camera.
         Raise InputError if the numbers of tables and cameras differ, if cameras mix degrees and metres, if poses do not
         cover the frames, or if an identity occurs twice in a frame.
         """

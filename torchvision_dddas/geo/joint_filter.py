@@ -30,7 +30,7 @@ _ESTIMATED = 3  # number of estimated errors of a platform: position and heading
 
 
 class JointFilter:
-    """The joint state at a time: the numbers of the targets, then those of the platforms' errors."""
+    """The joint state at a time: the values of the targets, then the values of the platforms' errors."""
 
     def __init__(self, parameters: FusionParameters) -> None:
         self.time_s, self.targets = -math.inf, 0

@@ -3,7 +3,7 @@
 Telemetry, places and pixels are fitted together. The landmarks' corrections and residuals, in stated standard
 deviations, have a sum of squares A, whose expected value is their redundancy R: the number of measurements beyond those
 that the pose needs. If A is larger than chance allows, the landmarks' variances are multiplied by A / R. That factor is
-uncertain too, so the ellipse is that of Student's t distribution. Source: estimation of variance components (W.
+uncertain too, so the ellipse follows Student's t distribution. Source: estimation of variance components (W.
 Förstner, 1979).
 """
 
@@ -42,7 +42,7 @@ class Misfit:
 def student_factor(freedom: float) -> float:
     """Return the factor on an estimated variance with which a 95 % ellipse holds 95 %.
 
-    It is the quantile of F with 2 and `freedom` degrees of freedom over that of chi-square with 2, in closed form.
+    It is the quantile of F with 2 and `freedom` degrees of freedom over the quantile of chi-square with 2.
     """
     return freedom * (20 ** (2 / freedom) - 1) / (2 * float(np.log(20)))
 

@@ -71,9 +71,9 @@ def _known(reports: Landmarks | Telemetry | None) -> np.ndarray:
 
 
 def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site:
-    """Convert landmarks and telemetry to local metres: those of the landmarks, or east and north of their first place.
+    """Convert landmarks and telemetry to the landmarks' local metres, or to metres east and north of their first place.
 
-    Without landmarks the metres are those of the telemetry, or east and north of the vehicle's first place.
+    Without landmarks, use the telemetry's local metres, or metres east and north of the vehicle's first place.
     Raise InputError if neither gives a place, degrees and metres are mixed, longitude and latitude look swapped, the
     vehicle is below the ground throughout, its camera looks into the sky, or it is far from the landmarks.
     """
@@ -188,7 +188,7 @@ def _match_ground(
 ) -> tuple[Telemetry, list[str]]:
     """Return telemetry whose altitude counts from the ground below, and notes if log and elevation disagree.
 
-    Raise InputError if the heights of the elevation are those of the log in another unit.
+    Raise InputError if the elevation has the log's heights in another unit.
     """
     notes, altitude, up_m = list[str](), telemetry.altitude_m, ground_height(elevation, telemetry.place)
     takeoff_m = math.nan if camera is None else camera.takeoff_above_sea_m

@@ -67,7 +67,7 @@ class _Stay:
     is_counted: bool = False
 
     def is_clear(self, time_s: float, distance: float) -> bool:
-        """Return whether the target is clear of the border by its distance, or by its mean distance on this side."""
+        """Return whether the target is clear of the border by its distance, or by the mean since the last passage."""
         begun_s, many, total = self.distances if self.distances[1] else (time_s, 0, 0.0)
         self.distances = begun_s, many + 1, total + distance
         mean, independent = (total + distance) / (many + 1), min(many, max(time_s - begun_s, 0) / _APART_S) + 1

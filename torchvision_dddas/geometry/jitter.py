@@ -5,7 +5,7 @@ from collections import deque
 
 import numpy as np
 
-_APART_S = (0.0, 0.5)  # for errors from frame to frame, and slower errors; people hardly turn within 0.5 s
+_APART_S = (0.0, 0.5)  # measures errors from frame to frame, and slower errors; people turn little in 0.5 s
 _LATEST = 10  # effective number of positions in the running mean
 
 

@@ -191,7 +191,7 @@ def _meet_ground(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance along rays (N, 3) to the ground, in ray lengths, and the ground's upward normal there (N, 3).
 
-    The distance is that of the first intersection. It is NaN where a ray does not meet ground of known height.
+    The distance ends at the first intersection. It is NaN where a ray does not meet ground of known height.
     """
     normal = np.tile([0.0, 0.0, 1.0], (len(way), 1))
     down = np.where(way[:, 2] < -1e-9 * np.linalg.norm(way, axis=1), way[:, 2], np.nan)

@@ -185,7 +185,7 @@ class TextFiles:
 class CsvText(NamedTuple):
     """The cells of a CSV without surrounding blanks; blank lines are left out.
 
-    header: the cells of the first line, none in an empty file. line: number of each further row, from 1. rows: cells.
+    header: the cells of the first line, none in an empty file. line: line number of each row, from 1. rows: cells.
     """
 
     header: list[str]

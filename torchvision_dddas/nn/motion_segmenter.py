@@ -125,8 +125,8 @@ class MotionSegmenter(nn.Module):
 
     `detection.detect_masks` adds the detector's later steps: hulls, tracklets, outlines, small targets.
 
-    Parameters that are named in `tuned` are nn.Parameters, float64 like the numbers of the settings. All others are
-    those of the settings, or are given in a call. whole: round where the engines do, straight through; False never
+    Parameters that are named in `tuned` are nn.Parameters, float64 like the numbers of the settings. All others come
+    from the settings, or are given in a call. whole: round where the engines do, straight through; False never
     rounds, for gradient checks.
 
     On a GPU the host waits for the device in only two cases. A size in pixels that is a tensor (blur_px, erode_px,
@@ -184,7 +184,7 @@ class MotionSegmenter(nn.Module):
     ) -> Segmentation:
         """Segment every frame of clips of RGB or grey pictures in [0, 1].
 
-        later_from_earlier: px; estimated by default. values: parameters by name, which replace those of the settings
+        later_from_earlier: px; estimated by default. values: parameters by name, which override the settings
         and the module. A frame is compared with the neighbours of `difference.near_frames` on both sides; at the ends
         of a clip, with the two nearest on one side.
 

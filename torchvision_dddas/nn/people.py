@@ -42,7 +42,7 @@ class PersonScorer(nn.Module):
     def __init__(
         self, weights: Float[Tensor, " D"], bias: float, *, layout: F.Layout | None = None, window_stride_px: int = 8
     ) -> None:
-        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: step from window to window.
+        """weights: `layout.features` numbers in OpenCV's order. window_stride_px: step from window to window.
 
         Raise InputError for another number of weights.
         """

@@ -20,5 +20,5 @@ class PlaneHomography(nn.Module):
     def forward(
         self, ground: Float[Tensor, "B n 2"], image: Float[Tensor, "B n 2"], weight: Float[Tensor, "B n"]
     ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-        """Return image_from_ground, and which were solved. weight: of each landmark's squared error; 0 ignores it."""
+        """Return image_from_ground, and whether each is valid. weight: of a landmark's squared error; 0 ignores it."""
         return F.find_homography(ground, image, weight)

@@ -195,7 +195,7 @@ class FrameRegistration(nn.Module):
         return self._judged(matrix, points, end, tracked, ransac_px)
 
     def _track(self, frames: "_FramePairs", guess: Tensor | None, search: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return the points' new places, and which were found there and, if requested, on the way back."""
+        """Return the points' new places, and whether each was found there and, if requested, on the way back."""
         given, limit_px = (frames.points, frames.earlier, frames.later, guess), self.settings.forward_backward_px
         if limit_px > 0 and self.effort.branches:
             end, found = F.forward_backward(*given, limit_px=limit_px, **search)

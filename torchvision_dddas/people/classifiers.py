@@ -208,7 +208,7 @@ def _read_opencv(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     except InputError:
         raise
     except (ValueError, IndexError, cv2.error, SystemError):
-        raise InputError(f"classifier {path} is a broken file: its parts do not fit; save it again") from None
+        raise InputError(f"classifier {path} is a broken file: its parts do not fit together; save it again") from None
     raise InputError(
         f"classifier {path} has neither an SVMDetector (cv2.HOGDescriptor.save) nor the support vectors of cv2.ml"
     )

@@ -87,7 +87,7 @@ class WindowScorer(Protocol):
 def load_scorer(parameters: PeopleParameters, backend: str = "auto", svm: LinearSvm | None = None) -> WindowScorer:
     """Return the window scorer of a backend.
 
-    svm: the classifier; None: the one that the settings name. Raises InputError as `wants_torch` and `load_classifier`.
+    svm: the classifier; None: the classifier in the settings. Raises InputError as `wants_torch` and `load_classifier`.
     """
     svm = load_classifier(parameters) if svm is None else svm
     if not wants_torch(backend):

@@ -344,7 +344,7 @@ def locator_facts(locator: AerialLocator) -> dict[str, Any]:
 
 
 def map_site(locator: AerialLocator, background: Path | None) -> MapSite:
-    """Return the data that maps show of the ground. Raise InputError for a background that cannot be read."""
+    """Return the data of the ground that maps show. Raise InputError for a background that cannot be read."""
     site = locator.site
     return MapSite(
         names=site.landmarks.names,

@@ -14,8 +14,8 @@ from torchvision_dddas.geometry import best_pairs
 
 _REACH, _CELL = 4.0, 0.2  # largest shift, and size of the cells for votes, in median heights
 _AXIS = np.arange(-np.ceil(_REACH / _CELL) - 1, np.ceil(_REACH / _CELL) + 2) * _CELL  # centres of the cells
-_AWAY = np.hypot(_AXIS[:, None], _AXIS)
-_AROUND = np.array([[row * len(_AXIS) + column] for row in (-1, 0, 1) for column in (-1, 0, 1)])  # of 9 cells
+_AWAY = np.hypot(_AXIS[:, None], _AXIS)  # length of the shift of each cell
+_AROUND = np.array([[row * len(_AXIS) + column] for row in (-1, 0, 1) for column in (-1, 0, 1)])  # a block of 3 x 3
 # If more than _STILL_SHARE of the tracks lie within _STILL median heights of a detection, no shift is searched for.
 _STILL, _STILL_SHARE = 0.15, 0.7
 _MOST = 3  # largest number of candidates

@@ -15,8 +15,8 @@ from torchvision_dddas.types import Float, Int, Tracks
 
 # Standard deviation of a crowd's position: a constant, a share of its radius, and a part that grows while it is unseen.
 _SIGMA_M, _SIGMA_SHARE, _SIGMA_M_S = 0.8, 0.2, 0.7
-_UNKNOWN_M_S = 3.0  # that part for a target that was seen once: it may walk, or drive slowly
-# The gate, in these standard deviations; the penalty for an e-fold change of radius, and the largest penalty.
+_UNKNOWN_M_S = 3.0  # the growing part for a target that was seen once, which may walk or drive slowly
+# The gate, in standard deviations of the position; the penalty for an e-fold change of radius, and the largest penalty.
 _GATE, _SIZE_PENALTY, _LARGEST_SIZE_PENALTY = 3.0, 0.8, 1.2
 # Score for the same picture identity as before.
 _SAME_TRACK_SCORE = 1.0

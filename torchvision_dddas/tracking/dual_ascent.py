@@ -242,7 +242,7 @@ def _low_prices(gain: Gain) -> Prices:
 
 
 def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndarray, "P 2"]]:
-    """Return prices with the smallest prices of the other two layers for those of `layer`, and the assigned pairs.
+    """Minimize the prices of the two layers other than `layer`. Return all prices, and the assigned pairs.
 
     The new prices are the mean of the two extreme dual solutions of the assignment, because an extreme solution would
     leave no freedom to the next layer.

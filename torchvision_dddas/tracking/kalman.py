@@ -6,7 +6,7 @@ This is exact for a straight walk at constant speed towards a pinhole camera, or
 
 States are (N, COLUMNS) float64 arrays with one row for each target, in pixels and looks, or tensors with leading axes.
 The variances of position and velocity are per axis, for two independent axes, in squared target heights, because near
-and distant targets move by the same number of their own heights. The variances of size are those of the log height.
+and distant targets move by the same number of their own heights. The variances of size belong to the log height.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ COLUMNS = 14
 SIZE_SCATTER = 0.1
 """Default standard deviation of the log height of a detection."""
 _GROWTH = 0.15  # standard deviation of a new target's growth in a look, as a share of the usual step
-_GROWTH_CHANGE = 0.4  # standard deviation of the change of growth, as a share of that of the velocity's change
+_GROWTH_CHANGE = 0.4  # standard deviation of the change of growth, as a share of the velocity change's deviation
 _WIDTH_GAIN = 0.5
 _FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: the predicted distance is at least half of the current one
 

@@ -18,7 +18,7 @@ _LEAST_SHARE = 0.25  # smallest share of the observed step that counts as motion
 _LOOKS = 30  # number of looks over which targets are counted
 _START_MISSING, _PRIOR_LINKS, _FADE = 0.03, 20, 0.99  # prior share of misses, its weight in links, decay per look
 _SHORT = 3  # longer gaps, in looks, are hidden targets and not misses of the detector
-_PRIOR_DETECTIONS = 30  # weight of the prior of the turnover
+_PRIOR_DETECTIONS = 30  # turnover = new tracks / (detections + this number)
 _TURNOVER = (0.01, 0.2)  # bounds of the turnover
 
 

@@ -6,8 +6,8 @@ The score of a link is the sum of the logarithms of three terms:
 - the likelihood of the detection's size;
 - the odds that the target is still there and is detected.
 
-A target without a link scores 0. Therefore no dummy needs tuning. (Appendix C gives dummies an affinity of their own,
-and its optimum is then to link nothing.)
+A target without a link scores 0, so the score of a missing detection needs no tuning. (Appendix C gives an affinity to
+the dummy that stands for a missing detection. The best solution is then to link nothing.)
 """
 
 import math
@@ -27,7 +27,7 @@ _LEAST_SCORE = -4.0  # pairs that cannot score more because of their distance ar
 _FEW = 4000  # up to this number, all pairs are compared without sorting
 _LARGEST_SIZE_PENALTY = 8.0
 _LARGEST_GONE = 0.95
-# Variance of positions that comes from detection errors, in `scatter` squared, and its largest share of the variance.
+# Variance of a position by detection errors, in units of `scatter` squared, and its limit as a share of all variance.
 _NOISE_SHARE, _MOST_NOISE = 1.5, 0.95
 _BORDER = 0.3  # a target this near to the border, in heights, may cross the border even at rest
 
@@ -133,7 +133,7 @@ def newborn_scores(look: BoxLook, parameters: TrackParameters, velocities: np.nd
 def likely_velocities(state: np.ndarray, flow: np.ndarray, common: np.ndarray) -> np.ndarray:
     """Return (W, N, 2) likely velocities, px a look, of targets that were detected once.
 
-    The first is the common velocity, the others are those of the nearest tracks. state: (N, kalman.COLUMNS). flow:
+    The first is the common velocity; the others are the nearest tracks' velocities. state: (N, kalman.COLUMNS). flow:
     (K, kalman.COLUMNS) other tracks with known velocities. common: (2,) their common velocity.
     """
     right, down = flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1]

@@ -176,7 +176,7 @@ class FixedLagSmoother:
         return given
 
     def _boxes_at(self, box_px: np.ndarray, there: int, here: int) -> np.ndarray:
-        """Transform boxes (N, 4) from the coordinates of the sampled frame `there` to those of the frame `here`."""
+        """Transform boxes (N, 4) from the coordinates of the sampled frame `there` to the coordinates of `here`."""
         low, high = sorted((there, here))
         oldest = self.count - len(self.steps)
         between = range(low + 1, high + 1) if self.has_moved else ()

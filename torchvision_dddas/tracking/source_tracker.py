@@ -317,7 +317,7 @@ def smallest_dispersion(window: Sequence[Features], feature: Feature, parameters
 
 
 def weigh(window: Sequence[Features], parameters: PaperParameters) -> tuple[float, float, float | None]:
-    """Return the weight of location in a window, the dispersion of locations, and that of appearances or None."""
+    """Return the weight of location in a window, and the dispersions of locations and of appearances (or None)."""
     location = smallest_dispersion(window, "location", parameters)
     if not needs_appearance(window, parameters):
         return 1.0, location, None

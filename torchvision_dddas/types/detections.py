@@ -52,7 +52,7 @@ class Detections(Boxes):
         """Return another detector's detections, in pixels: supervision, ultralytics (Results, Boxes), torchvision, ...
 
         detections: an object or a mapping that has a name of each row of _FOREIGN, with arrays or tensors. Scores that
-        are None count as 1. Classes are those of `data["class_name"]` (N,), or the names that `names` gives to the
+        are None count as 1. Classes are `data["class_name"]` (N,), or the names that `names` gives to the
         numbers. Raise InputError if boxes or scores are missing, have other shapes, or are refused by `check_boxes`.
         """
         given, names = detections, getattr(detections, "names", None)

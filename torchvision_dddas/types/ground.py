@@ -61,7 +61,7 @@ class Camera(Record):
         if self.given is not None:
             return name in self.given
         value, default = getattr(self, name), type(self).__dataclass_fields__[name].default
-        if isinstance(value, float):  # a given heading of 0 is another object than the default
+        if isinstance(value, float):  # a heading that was given as 0 is not the default object
             return value == value and value is not default
         return bool(value != default)
 

@@ -99,7 +99,7 @@ class Telemetry(Table):
         after = min(int(times.searchsorted(time_s)), count - 1)
         end_s = times.item(after)
         before, share = after, 0.0
-        if after > 0 and time_s < end_s:  # otherwise the time is outside, or on a sample, which then counts alone
+        if after > 0 and time_s < end_s:  # else the time is outside, or on a sample, which needs no interpolation
             before = after - 1
             share = (time_s - times.item(before)) / (end_s - times.item(before))
 
@@ -140,7 +140,7 @@ class Telemetry(Table):
 
 
 _TURN = 2 * math.pi
-_LEAST_SINE = 0.1  # of the angle of the view below the horizon
+_LEAST_SINE = 0.1  # smallest sine of the angle of the view below the horizon
 
 
 def _wrap(value: float, full: float) -> float:

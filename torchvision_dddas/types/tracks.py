@@ -40,7 +40,7 @@ class Tracks(Boxes):
     identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections. row: (N,) int64, the row in the
     frame's detections; -1 for a box that bridges a gap. link: (N,) in [0, 1], confidence that the box belongs to its
     identity, and not to another identity that could have taken it. NaN for the first box of a track, for a bridging
-    box, and if unknown. label, class_id: of the detection; a bridging box has those of its identity before the gap.
+    box, and if unknown. label, class_id: of the detection; a bridging box keeps its identity's earlier class.
     frame: number of the frame; (N,) in a table that `concat` has joined. appearance: whether it was used; None if there
     was no choice: nothing to link, or no picture.
 

@@ -51,7 +51,7 @@ def measure_chains(
     that fast cells leave time for others. tell: called with the name of each cell before its measurement.
     """
     cells = [(chain, size) for size in sorted(sizes) for chain in chains]
-    cells.sort(key=lambda cell: cell[0].startswith("torch"))  # last, because torch adds to the memory afterwards
+    cells.sort(key=lambda cell: cell[0].startswith("torch"))  # torch last: it raises the memory of later chains
     weights, deadline = [width * height for _, (width, height) in cells], time.perf_counter() + seconds
     for k, (chain, size) in enumerate(cells):
         if (left := deadline - time.perf_counter()) <= 0:

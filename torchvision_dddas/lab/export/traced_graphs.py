@@ -84,7 +84,7 @@ class SegmentationStep(nn.Module):
 
 TOLERANCE_PX = 1e-6
 HYPOTHESES = 128
-# Torch and ONNX Runtime resolve ties of keypoints and hypotheses differently, so compare places, not numbers.
+# Torch and ONNX Runtime break ties between keypoints and hypotheses differently: compare positions, not matrices.
 CORNER_PX, MASK_OFF, LEVELS_OFF = 0.1, 0.02, 1e-3
 LEAST_KEYPOINTS = 48
 EXAMPLES = 2

@@ -45,7 +45,7 @@ class Moment:
     pose: the camera's true pose at mid-exposure of the picture's middle row. velocity_m_s, turn_rad_s: (3,) its rates
     along and about east, north, up. flight: the UAV's own report, in longitude and latitude; None while it is silent.
     reports: the ground vehicles' reports since the last frame. heading_rad: (K,) true headings of their cameras.
-    reported_lonlat_deg: (K, 2), NaN while silent. reported_heading_rad: (K,). The vehicles' true places are those of
+    reported_lonlat_deg: (K, 2), NaN while silent. reported_heading_rad: (K,). The vehicles' true places are in
     the bodies of kind ugv, in the same order. picture: "", "frozen" or "dropped". events: descriptions of events.
     """
 

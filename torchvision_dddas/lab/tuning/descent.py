@@ -113,7 +113,7 @@ def descend(
 ) -> Descended:
     """Minimize the family's loss. The parameters are changed in place and end in their best state.
 
-    tell: called with each step, also those of a resumed checkpoint. place: file of a checkpoint, written at every
+    tell: called with each step, also with a checkpoint's steps. place: file of a checkpoint, written at every
     measurement. resume: continue from the checkpoint if it exists. Raise InputError if there are no examples, if no
     parameter has an effect on the loss, if the loss is not finite at the start, and for another descent's checkpoint.
     """

@@ -74,7 +74,7 @@ class MotionFamily(Family):
 
     with_later_steps: keep the effect of the hard steps after the hulls near the original settings (see
     `LabelledFrames`). Without it, tuning works better from a bad start. softness: a share of each threshold. Above a
-    tenth, background just below the threshold adds up, and the loss is least at a threshold above that of hard masks.
+    tenth, background just below the threshold adds up, and the loss is least at a higher threshold than for hard masks.
     """
 
     with_later_steps: bool = True

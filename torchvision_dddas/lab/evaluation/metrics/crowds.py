@@ -1,7 +1,7 @@
 """How well crowds were detected, tracked, located and confirmed in a simulated run, from truth and results.
 
 Each measure is defined at its field of CrowdScore. Boxes are x, y of the top left pixel, width, height. A box contains
-a pixel if it contains the pixel's centre. Metres are those of the truth.
+a pixel if it contains the pixel's centre. Metres are in the truth's coordinates.
 """
 
 import math

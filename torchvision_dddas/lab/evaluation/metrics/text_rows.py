@@ -65,8 +65,8 @@ def read_columns(
     """Read a table separated by commas or blanks; columns after the named columns are ignored.
 
     columns: names; "frame" and "identity" are whole, frames from `first` to `last`. word: the column that holds a word;
-    quotes around it are removed. what: the content, for messages. may_end_early: a line without its last cell has a 1
-    there. Raise InputError with file and line for too few columns and for numbers that are not finite.
+    quotes around it are removed. what: the content, for messages. may_end_early: read the last cell as 1 if a line
+    lacks it. Raise InputError with file and line for too few columns and for numbers that are not finite.
     """
     file = f"{what} {path}".strip()
     lines = [(n, text) for n, text in enumerate(read_text(path, name=file).splitlines(), 1) if text.strip()]

@@ -214,7 +214,7 @@ def read_scores(folder: Path) -> ScoredStudy:
     except FileNotFoundError:
         raise InputError(
             f"{folder} is not a study: it lacks {SCORES}; wanted a folder that dddas evaluate --dataset wrote, or "
-            "that of a method of dddas evaluate --names"
+            "a method's folder from dddas evaluate --names"
         ) from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None

@@ -374,7 +374,7 @@ class SweepRecord:
         return {known.name: known.default for known in all_parameters() if known.name in tried}
 
     def value_of(self, trial: Trial, parameter: str) -> object:
-        """Return a parameter in a trial: the tried value, else that of the settings."""
+        """Return a parameter in a trial: the tried value, else the settings' value."""
         return trial.parameters.get(parameter, _current(self.settings, parameter))
 
     def _write_json(self) -> None:
