@@ -56,7 +56,7 @@ def open_session(content: bytes | str, path: Path, provider: str = "cpu", thread
     except Exception as error:  # the error classes of onnxruntime have no other common base class
         first = str(error).partition("\n")[0]
         raise InputError(
-            f"onnxruntime {onnxruntime.__version__} cannot open {path}: {first}; is it a model in ONNX, or a newer one?"
+            f"onnxruntime {onnxruntime.__version__} cannot open {path}: {first}; is it an ONNX model, or a newer model?"
         ) from None
     # The runtime only warns and falls back to the CPU, for example if a library of CUDA is missing.
     if known[provider] not in session.get_providers():

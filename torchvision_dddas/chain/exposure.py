@@ -41,7 +41,7 @@ class View:
 
 
 def match_exposure(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return both grey pictures, (H, W) uint8, the darker one converted to the other's exposure if they differ clearly.
+    """Return both grey pictures, (H, W) uint8, the darker picture in the other's exposure if they differ clearly.
 
     Lucas-Kanade compares grey levels. A jump of the gain by 15 % moves its homographies by 1 to 10 px at the corners,
     although most of its points still agree. The darker picture is converted, so that pixels that are clipped at white

@@ -171,7 +171,7 @@ class SmallParameters(Group):
     max_box_px: int = parameter(1500, "largest box area of a candidate", "px", 10, 1_000_000)
     max_candidates: int = parameter(80, "in frames with more candidates none is tracked", "blobs", 1, 10_000)
     max_blobs: int = parameter(4, "with more large blobs than this, the parallax test is applied", "blobs", 0, 1000)
-    parallax_px: float = parameter(0.15, "larger inlier residuals mean parallax: no small targets", "px", 0, 10)
+    parallax_px: float = parameter(0.15, "search for no small targets if inlier residuals exceed this", "px", 0, 10)
     gate_px: float = parameter(4.0, "largest distance of a candidate from the track's prediction", "px", 0.5, 50)
     hits: int = parameter(10, "frames with a candidate that a track needs to be confirmed", "frames", 2, 60)
     min_travel_px: float = parameter(3.0, "smallest distance that a confirmed track has travelled", "px", 0, 100)

@@ -51,7 +51,7 @@ class SteeringParameters(Group):
     station_m: float = parameter(12.0, "distance of UGVs from the crowd they observe", "m", 2, 1000)
     look_m: float = parameter(14.0, "largest distance at which a UGV recognizes people: bodies of 64 px", "m", 1, 1000)
     picture_s: float = parameter(1.0, "time between two pictures of one UGV", "s", 0.01, 3600)
-    maximum_altitude_m: float = parameter(0.0, "largest altitude of the UAV; 0: twice the initial one", "m", 0, 10_000)
+    maximum_altitude_m: float = parameter(0.0, "largest UAV altitude; 0: twice the initial altitude", "m", 0, 10_000)
 
 
 class LiveParameters(Group):

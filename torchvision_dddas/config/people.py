@@ -38,7 +38,7 @@ class PeopleParameters(Group):
     )
     overlap: float = parameter(0.4, "nms: bodies with a larger intersection over union are the same person", "-", 0, 1)
     contained: float = parameter(
-        0.7, "nms: bodies that share a larger part of the smaller one are also the same person; 1: off", "-", 0, 1
+        0.7, "nms: bodies that share a larger part of the smaller body are also the same person; 1: off", "-", 0, 1
     )
     settle: float = parameter(
         0.75, "nms: a box is the mean of the windows with at least this intersection over union", "-", 0, 1

@@ -17,13 +17,13 @@ class TrackParameters(Group):
     )
     doubt: float = parameter(
         8.0,
-        "a detection is tracked if its doubt, 1 / score - 1, is at most this many times the usual one",
+        "a detection is tracked if its doubt, 1 / score - 1, is at most this many times the usual doubt",
         "-",
         0,
         1000,
     )
     birth_doubt: float = parameter(
-        3.0, "a detection may start a track if its doubt is at most this many times the usual one", "-", 0, 1000
+        3.0, "a detection may start a track if its doubt is at most this many times the usual doubt", "-", 0, 1000
     )
     hits: int = parameter(3, "detections that confirm a track; a single one of score 1 is enough", "frames", 1, 60)
     smooth: bool = parameter(True, "move boxes with a score below 1 to the smoothed track")

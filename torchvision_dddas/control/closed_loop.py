@@ -237,7 +237,7 @@ class Steering:
     """Commands the vehicles and decides which frames are processed. Pass located frames in order to `update`."""
 
     def __init__(self, settings: Settings, camera: Camera, rate_hz: float, vehicles: Sequence[str]) -> None:
-        """Start without targets. camera: the aerial one. vehicles: names of the ground vehicles, as in Landmarks."""
+        """Start without targets. camera: the aerial camera. vehicles: names of the ground vehicles, as in Landmarks."""
         self.settings, self.camera, self.rate_hz = settings, camera, rate_hz
         self._predictor, self._log = TargetPredictor(camera), AdjustmentLog()
         self._uav, self._team = UavSteering(settings, self._log), UgvTeam(settings, vehicles, self._log)

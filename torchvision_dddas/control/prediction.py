@@ -214,5 +214,5 @@ class TargetPredictor:
 
 
 def _is_renamed(place_m: np.ndarray, radius_m: float, here_m: np.ndarray) -> bool:
-    """Return whether a target (2,) that was not located is so near to a located one (N, 2) that it is the same."""
+    """Return whether a target (2,) that was not located is so near a located target (N, 2) that they are the same."""
     return len(here_m) > 0 and bool(np.linalg.norm(here_m - place_m, axis=1).min() < _RENAMED_M + radius_m)

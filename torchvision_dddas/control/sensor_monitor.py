@@ -11,8 +11,8 @@ from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 # that is longer.
 _SILENT_S = 2.0
 _SLOWER = 3.0
-# A report is a leap if its distance from the last one exceeds the sum of _LEAP_M, _LEAP_SIGMAS standard deviations, and
-# the distance that a vehicle drives at _FASTEST_M_S.
+# A report is a leap if its distance from the last report exceeds the sum of _LEAP_M, _LEAP_SIGMAS standard deviations,
+# and the distance that a vehicle drives at _FASTEST_M_S.
 _LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
 # A jerk, for example by a gust, is a change of the ground's velocity in the picture's centre by more than _JERK_M_S
 # from the median of the last _USUAL_S.
@@ -29,7 +29,7 @@ class Notice:
 
 
 class SensorMonitor:
-    """Compares reports and pictures with earlier ones. Call its checks once for each scene."""
+    """Compares reports and pictures with earlier reports and pictures. Call its checks once for each scene."""
 
     def __init__(self, names: tuple[str, ...], rate_hz: float) -> None:
         """Start without reports. names: names of the ground vehicles. rate_hz: frames a second."""

@@ -166,7 +166,7 @@ class UavSteering:
     def _search(
         self, prediction: Prediction, team_m: np.ndarray, altitude: float, mount: CameraMount, lapse_s: float
     ) -> None:
-        """Without targets, wait over the last one, then climb to see more, and at last return to the team."""
+        """Without targets, wait over the last target, then climb to see more, and at last return to the team."""
         gone_s = np.inf if self._found_s is None else self._now_s - self._found_s
         if self._group & set(prediction.target.tolist()):
             why = f"target {min(self._group)} is still there, but is not human"

@@ -22,7 +22,7 @@ _KEEP_OFF_M = 5.0
 # Smallest margin of a station inside the aerial picture, as a share of half the picture.
 _WITHIN = 0.2
 # Number of rotations of the ring that are tried. The assignment changes only if the total distance to drive falls below
-# _BETTER of the current one, and the mean distance is at least _NEAR of the ring's radius.
+# _BETTER of the current distance, and the mean distance is at least _NEAR of the ring's radius.
 _TURNS, _BETTER, _NEAR = 12, 0.75, 0.5
 # A vehicle that reports no position still counts for this time, because planned waypoints bridge dropouts.
 _SILENT_S = 10.0

@@ -46,7 +46,7 @@ class BlobMotion:
     """The motion of a blob over the registered background.
 
     velocity_px: (2,) pixels a frame, NaN where unknown. steady: share of the blob's core that has the same velocity to
-    both neighbour frames and a different one from the surroundings. frame: centre_u, centre_v, scale. affine: (3, 2)
+    both neighbour frames, but not the velocity of the surroundings. frame: centre_u, centre_v, scale. affine: (3, 2)
     for each neighbour frame; the displacement in pixels is affine[0] + affine[1] (u - centre_u) / scale + affine[2]
     (v - centre_v) / scale. missed: share of the core whose flow the affine motion does not explain.
     """

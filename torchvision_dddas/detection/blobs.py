@@ -70,7 +70,7 @@ def find_blobs(
     """Return the connected regions (8 neighbours) of `core` that have enough area and a high enough peak of evidence.
 
     core, evidence: (H, W) uint8. threshold: evidence above which a pixel belongs to the blob's core. hull: fill convex
-    hulls; a hull that contains another one replaces it. scale: side of a map pixel in picture pixels; areas and blobs
+    hulls; a hull replaces the hulls that it contains. scale: side of a map pixel in picture pixels; areas and blobs
     are in picture pixels.
     """
     return make_blobs(find_regions(core, evidence, min_area_px, peak, scale), threshold, hull, scale)
@@ -97,7 +97,7 @@ def label_parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Label the connected parts (8 neighbours) of a (H, W) uint8 mask, and return (H, W) labels and (N, 5) int32 rows.
 
     Labels start at 1. A row is x, y, width, height and area. OpenCV's default algorithm takes two to three times as
-    long as the one used here.
+    long as this algorithm.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(mask, 8, cv2.CV_32S, cv2.CCL_GRANA)
     return labels, stats[1:]

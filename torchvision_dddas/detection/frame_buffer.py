@@ -12,7 +12,7 @@ from torchvision_dddas.detection.observation import Observation
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.types import Adjustment, Frame, Registration
 
-# A picture is blank if its grey levels have a smaller standard deviation; pictures of fog have a larger one.
+# A picture is blank if its grey levels have a smaller standard deviation; pictures of fog have a larger deviation.
 _BLANK_LEVELS = 1.0
 
 
@@ -87,7 +87,7 @@ class FrameBuffer:
         return first, last
 
     def motion(self, index: int, other: int) -> np.ndarray:
-        """Return the homography (3, 3) of the background from a frame to another one, chained over reliable steps."""
+        """Return the homography (3, 3) of the background from a frame to another frame, chained over reliable steps."""
         steps = [slot.step for slot in self.span(min(index, other), max(index, other))]
         last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
         return last_from_first if other > index else np.linalg.inv(last_from_first)

@@ -151,7 +151,7 @@ def split_by_trail(
     """Return the blob with its velocity, or its two parts with their velocities if the trail shows two motions.
 
     history: must contain the current frame's silhouette. size: (width, height) of the picture. A velocity is (2,)
-    pixels a frame over the background. It is NaN for a blob without a usable trail: one that moves very slowly, or by
+    pixels a frame over the background. It is NaN for a blob without a usable trail, which moves very slowly, or by
     more than its own length a frame.
     """
     x, y, width, height = blob.box
@@ -195,7 +195,7 @@ def split_by_trail(
 
 
 def _share_out(body: np.ndarray, ways: list[tuple[np.ndarray, float]]) -> np.ndarray:
-    """Assign each pixel of the body to the trail that it lies ahead of; if it lies ahead of both, to the nearer one.
+    """Assign each pixel of the body to the trail that it lies ahead of; if it lies ahead of both, to the nearer.
 
     ways: trails and their headings. Returns (2, H, W) bool.
     """

@@ -40,8 +40,8 @@ _SHORT_LEVELS = 1
 _DEEP_WINDOW_PX = 21
 # If a step with predicted motion has a smaller share of inliers, it is repeated with new keypoints and all levels.
 _LEAST_SHARE = 0.4
-# New keypoints are detected when fewer than _LEAST_LEFT of the detected ones are left, or when those left cover fewer
-# than _LEAST_COVER of the cells, in a grid of _COARSE x _COARSE cells, that the detected ones covered.
+# New keypoints are detected when fewer than _LEAST_LEFT of the detected keypoints are left, or when they cover fewer
+# than _LEAST_COVER of the cells, in a grid of _COARSE x _COARSE cells, that all detected keypoints covered.
 _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
 # Inlier tolerances of the successive refits, as factors of RANSAC's tolerance. On half pictures two refits suffice: the
@@ -207,7 +207,7 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
     carried, earlier.carried = earlier.carried if carrying else None, None
     if carried is not None:
-        # Detect new keypoints if the carried ones are too old, too few, too clustered, or more than settings allow.
+        # Detect new keypoints if the carried points are too old, too few, too clustered, or more than settings allow.
         if (
             carried.age >= parameters.redetect_frames
             or len(carried.points) > parameters.keypoints

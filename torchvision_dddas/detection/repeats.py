@@ -26,7 +26,7 @@ class RepeatRule:
         self._differences: deque[float] = deque(maxlen=_RECENT)
 
     def is_repeat(self, grey: np.ndarray) -> bool:
-        """Return whether the next picture, (H, W) uint8, repeats the one before."""
+        """Return whether the next picture, (H, W) uint8, repeats the picture before."""
         before, self._before = self._before, grey
         if before is None or before.shape != grey.shape:
             return False

@@ -48,7 +48,7 @@ BLOB_TINY = Worth(9.0, 9.0, hits=4)
 
 _LEAST_HITS, _LEAST_TRAVEL_PX = 2, 1.0
 _SCORE_BOUNDS = (-8.0, 6.0)
-# If two boxes share more than _COVERED of the smaller one, only one is chosen. Boxes with an IoU above _SAME show the
+# If two boxes share more than _COVERED of the smaller box, only one is chosen. Boxes with an IoU above _SAME show the
 # same target.
 _COVERED, _SAME = 0.3, 0.5
 # A blob that joins several targets has background between them: there its mean evidence, noise units, is below this.

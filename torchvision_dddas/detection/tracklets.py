@@ -150,7 +150,7 @@ def _guess(
     """Guess velocities from similar candidates in other looks.
 
     Return M guesses: (M,) index of the candidate, (M, 2) velocity in pixels a look, and (M,) looks over which it was
-    measured. A candidate without a similar one gets velocity 0.
+    measured. A candidate without a similar candidate gets velocity 0.
     """
     count = len(here)
     diagonal = np.hypot(*here.box_px[:, 2:].T)[:, None]

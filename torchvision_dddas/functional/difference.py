@@ -62,7 +62,7 @@ def absolute_difference(a: UInt8[Tensor, "*any"], b: UInt8[Tensor, "*any"]) -> U
 def match_exposure(
     earlier: Float[Tensor, "B 1 H W"], later: Float[Tensor, "B 1 H W"]
 ) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, "B 1 H W"]]:
-    """Return both pictures in whole grey levels, the darker one in the other's exposure if they differ clearly.
+    """Return both pictures in whole grey levels, the darker picture in the other's exposure if they differ clearly.
 
     This is the batched form of `chain.exposure.match_exposure`.
 
@@ -207,7 +207,7 @@ def noise_units(
     """Return the median of z / scale over textured pixels, at least 1; 1 if at most `least` pixels are textured."""
     level, seen = z.flatten(1), textured.flatten(1)
     total = seen.sum(1, dtype=torch.int32)
-    # The mean of the middle two can only be above the scale if the upper one is.
+    # The mean of the middle two can only be above the scale if the upper value is.
     is_high = (total > least) & ((seen & is_above(level, int(scale))).sum(1, dtype=torch.int32) >= total - total // 2)
     units = torch.ones_like(total, dtype=torch.float64)
     if all_true(~is_high):

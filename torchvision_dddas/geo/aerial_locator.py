@@ -62,7 +62,7 @@ _VAGUE = 0.2
 class FrameFix:
     """How one frame maps to the ground, and the landmarks that were used. adjustments and seconds are as in Scene.
 
-    time_s: time of the frame, later than fix.time_s if its picture repeats an earlier one.
+    time_s: time of the frame, later than fix.time_s if its picture repeats an earlier picture.
     """
 
     fix: Fix

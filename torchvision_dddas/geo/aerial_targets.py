@@ -147,7 +147,7 @@ class TargetSpeeds:
         self._latest: tuple[float, dict[int, np.ndarray]] = math.nan, {}  # time and velocities, by identity
 
     def carry(self, motion: np.ndarray, to_ground: Callable[[np.ndarray, np.ndarray], np.ndarray], level: bool) -> None:
-        """Shift every target by the shift of the ground at its last pixel between its last frame and the next one.
+        """Shift every target by the shift of the ground at its last pixel between its last frame and the next frame.
 
         motion: (3, 3) pixel homography from the frame before; NaN if unknown, then the targets stay. to_ground:
         function from pixels (N, 2) and heights (N,) to places (N, 2) in the next frame. level: the ground is a plane,
@@ -172,7 +172,7 @@ class TargetSpeeds:
         """Return the velocities in the next frame, m/s east and north; NaN if unknown or without identity (below 1).
 
         covariance_m2: covariance of the errors that are new in every frame; if unknown, a sigma of 1 m. seen: pixels u,
-        v of the places and their heights above the ground, for `carry`. A frame with the same time as the one before
+        v of the places and their heights above the ground, for `carry`. A frame at the time of the frame before
         gets the same velocities.
         """
         if time_s == self._latest[0]:
@@ -190,7 +190,7 @@ class TargetSpeeds:
                 self._tracks[name] = time_s, np.array([*place, 0.0, 0.0]), spread
                 continue
             _, state, spread = self._tracks[name]
-            if lapse > 0:  # otherwise the picture repeats the one before
+            if lapse > 0:  # otherwise the picture repeats the picture before
                 state, spread = _corrected(state, spread, lapse, place, noise)
                 self._tracks[name] = time_s, state, spread
             if spread.diagonal()[2:].max() < _KNOWN_M_S**2:

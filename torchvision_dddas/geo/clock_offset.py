@@ -1,6 +1,6 @@
 """Find the offset between the clock of a log and that of its clip from the camera's turns, which both record.
 
-Compare the turns over one second in the log with those from the registrations of the clip, for each clock offset. The
+Compare the turns over one second in the log with the turns from the clip's registrations, for each clock offset. The
 clip is interpolated at the times of the log, not the reverse: the noise of an interpolated log is smallest halfway
 between two samples, which would pull the offset there. Scale and mean are free in each axis, because a focal length may
 be guessed. The standard deviation is computed from the residuals, which need be neither white nor stationary.
@@ -121,7 +121,7 @@ def find_clock_offset(
         return clip.between(begin + offset_s, end + offset_s)
 
     def refine(offset_s: float) -> tuple[float, float, float, float]:
-        """Search the best offset near one. Return its likelihood, the offset, its sigma and the independent turns."""
+        """Search near an offset. Return the best likelihood, offset and sigma, and the number of independent turns."""
         sigma_s = count = 0.0
         for _ in range(_REFINEMENTS):
             slope = (seen(offset_s + _STEP_S / 10) - seen(offset_s - _STEP_S / 10)) / (_STEP_S / 5)
@@ -162,7 +162,7 @@ def _improve(logged: np.ndarray, seen: np.ndarray, slope: np.ndarray, step_s: fl
     """Return the change of an offset that fits the turns better, its standard deviation, s, and the independent turns.
 
     slope: (N, 3) derivative of `seen` by the offset. The variance is the largest of three estimates: for white
-    residuals, for stationary residuals of any correlation, and by blocks, which holds if turns are noisier than rest.
+    residuals, for stationary residuals of any correlation, and by blocks, which holds if turning adds noise.
     """
     scale, known = _fit(logged, seen, 1)[1], np.isfinite(logged + seen + slope).all(axis=1)
     if (n := int(known.sum())) < _LEAST:

@@ -170,7 +170,7 @@ def _sample_box(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -
 
 
 def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
-    """Find colours in all pictures, group them by hue, and return the best `count` groups, or all clear ones."""
+    """Find colours in all pictures, group them by hue, and return the best `count` groups, or all clear groups."""
     samples = [sample for number, one in enumerate(hsv) for sample in _find_samples(one, least_area_px, number)]
     groups: list[list[ColourSample]] = []
     for sample in sorted(samples, key=lambda one: -one.score):

@@ -58,7 +58,7 @@ class TargetFusion:
     ) -> list[FusedTargets]:
         """Add the targets that a platform located, and return a result for each measurement that is now final.
 
-        time_s: time of GroundLocations, by the clock of the aerial ones. lasting: whether the numbers of targets are
+        time_s: time of GroundLocations, by the aerial platforms' clock. lasting: whether the numbers of targets are
         identities. Targets without a place are left out. Raise InputError for another type, a missing time, several
         cameras in one record, or a mix of local metres without an origin and longitude and latitude.
         """

@@ -51,7 +51,7 @@ _ANOTHER = 1.5
 _KEPT_LIKELIHOOD = 0.95
 # Largest evidence of a single frame against a hypothesis: a report may jump.
 _MOST_EVIDENCE = 15.0
-# Solve a frame again, _AGAIN times at most, while its landmark errors are more than _MORE times the assumed ones.
+# Solve a frame again, _AGAIN times at most, while its landmark errors are more than _MORE times the assumed errors.
 _MORE, _AGAIN = 1.1, 4
 _POSE_PARTS = np.array(["heading", "heading", "heading", "place", "place", "altitude", "focal length"])
 # Key of each part of the pose in a camera's file.
@@ -180,7 +180,7 @@ class BiasFilter:
     def after(
         self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: PoseSolution
     ) -> "BiasFilter":
-        """Return the filter updated by a frame's solution, including errors correlated with the observed ones."""
+        """Return the filter updated by a frame's solution, including errors correlated with observed errors."""
         ours, theirs = self._matching_rows(prior.known, marks)
         before = self._in_one_frame(ours)
         gain = np.linalg.solve(before, self.covariance[ours]).T

@@ -22,7 +22,7 @@ from torchvision_dddas.types import Sightings
 
 # The state of a target: east, north, their velocities, and the body height in standard deviations.
 SIZE, PLACE, _HEIGHT = 5, np.arange(2), 4
-# Standard deviation of a platform's position within the filter, as a multiple of the stated one.
+# Standard deviation of a platform's position within the filter, as a multiple of the stated deviation.
 _FREE = 30.0
 _FASTEST_M_S = 10.0  # standard deviation of a new target's velocity
 _ROUNDS = 15  # iterations of the platforms' weights

@@ -15,7 +15,7 @@ from torchvision_dddas.geo.pose_estimation import EXACT_M, PoseSolution
 from torchvision_dddas.types import Bool, LandmarkObservations
 
 # A misfit counts if its probability by chance is below this: in a single frame, where it affects only that frame, and
-# over frames, where it is tested in every frame and affects all later ones.
+# over frames, where it is tested in every frame and affects all later frames.
 IN_A_FRAME, OVER_FRAMES = 0.05, 0.005
 
 
@@ -40,7 +40,7 @@ class Misfit:
 
 
 def student_factor(freedom: float) -> float:
-    """Return the factor on an estimated variance with which a 95 % ellipse holds 95 %.
+    """Return the factor on an estimated variance with which a 95 % ellipse holds 95 % of the true places.
 
     It is the quantile of F with 2 and `freedom` degrees of freedom over the quantile of chi-square with 2.
     """

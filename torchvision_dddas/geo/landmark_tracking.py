@@ -34,9 +34,9 @@ _LARGE, _FILL = 2.0, 0.5
 _GAIN = 0.3
 # Largest number of patches of one colour that are tracked.
 _MOST = 16
-# Margin by which the best patch must beat the next one to become the landmark.
+# Margin by which the best patch must beat the next patch to become the landmark.
 _MARGIN = 1.0
-# Patches whose log area is smaller than the best one's by more than this are not rivals.
+# Patches whose log area is smaller than the best patch's by more than this are not rivals.
 _ALIKE = 2.0
 
 
@@ -178,7 +178,7 @@ class _ColourTracker:
         return {int(i): int(rows[j]) for i, j in zip(*cheapest(cost), strict=True) if cost[i, j] < 100}
 
     def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:
-        """Decide which patch is the landmark. Keep the previous one unless it is lost or uncertain, or `anew` is set.
+        """Decide which patch is the landmark. Keep the previous patch unless it is lost or uncertain, or if `anew`.
 
         expected_px: (2,) expected pixel, NaN if unknown. usual_px: usual area of the landmarks' patches, inf if
         unknown.

@@ -295,7 +295,7 @@ def merge_detections(
     """Return the crowds as detections, and the (H, W) mask with their numbers. crowd: as from `group_targets`.
 
     The velocity of a crowd is the mean of its targets' velocities, weighted by area; its middle is the mean of their
-    foreground, and its class is the most frequent one.
+    foreground, and its class is the most frequent class.
     """
     size = int(crowd.max(initial=-1)) + 1
     area = np.maximum(found.area_px, 1e-9)

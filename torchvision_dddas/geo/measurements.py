@@ -44,7 +44,7 @@ class Measurement:
 
 
 def aerial_sightings(located: AerialLocations) -> tuple[Sightings, CameraPose | None, np.ndarray | None]:
-    """Return the sightings of an aerial camera, common errors as for level ground; and pose and root, if known."""
+    """Return the sightings of an aerial camera, common errors as on level ground, and pose and root if known."""
     positions, fix, n = located.positions, located.fix, len(located.positions)
     common = np.nan_to_num((positions.covariance_m2 - located.relative_m2).mean(axis=0)) if n else np.zeros((2, 2))
     pose = root = None

@@ -181,7 +181,7 @@ def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: flo
 
 
 def relative_width(marks: LandmarkObservations) -> float:
-    """Return the width of the landmarks as a share of their length, on the ground or in the picture, the smaller one.
+    """Return the width of the landmarks as a share of their length, the smaller share of ground and picture.
 
     Receiver errors make a row on the ground look wider than it is; in the picture they do not matter.
     """

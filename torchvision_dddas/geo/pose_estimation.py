@@ -24,7 +24,7 @@ from torchvision_dddas.geometry import (
 )
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
-# The smallest standard deviation of a landmark's place, m. With a smaller one the curvature matrix is singular.
+# The smallest standard deviation of a landmark's place, m. With a smaller deviation the curvature matrix is singular.
 EXACT_M = 1e-3
 # Index of the heading in a pose, and the number of headings that are tried if none is known.
 _HEADING, _HEADINGS = 2, 8

@@ -223,7 +223,7 @@ def _match_ground(
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
-    """Return whether longitude and latitude look swapped, judging by a near place in degrees, as the vehicle's."""
+    """Return whether longitude and latitude look swapped, judging by a near place in degrees (the vehicle's)."""
     known = _known(landmarks)
     if not landmarks.geographic or not len(known) or not np.isfinite(near_lonlat).all():
         return False
@@ -359,7 +359,7 @@ def fit_lens(telemetry: Telemetry, camera: Camera) -> Telemetry:
     """Return the telemetry with the field of view along u of the camera's pictures.
 
     A nominal focal length applies to the longer side. If the camera's file gives the focal length, the log's nominal
-    one only gives the zoom.
+    focal length only gives the zoom.
     """
     if not telemetry.is_nominal or not np.isfinite(telemetry.hfov_rad).any():
         return telemetry

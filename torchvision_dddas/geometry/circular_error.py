@@ -18,7 +18,7 @@ _TURNS = np.pi * (np.arange(64) + 0.5) / 64
 def circular_error_90(sigma_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
     """Return the radius in metres of the circle that contains the true position with 90 %; NaN where sigma is NaN.
 
-    sigma_m: standard deviations along the axes of the error ellipse, the longer one first, as from `semi_axes`. For
+    sigma_m: standard deviations along the axes of the error ellipse, the longer axis first, as from `semi_axes`. For
     this normal distribution, the probability beyond r is the mean over all angles t of exp(-r² / 2 (a² cos² t +
     b² sin² t)). The relative error of the radius is at most 1e-4.
 

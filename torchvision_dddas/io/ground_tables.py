@@ -43,7 +43,7 @@ LANDMARKS = Schema(
     *(Column(name, ".3f", *HEIGHT_M, may_be_empty=True) for name in ("elevation_m", "above_ellipsoid_m")),
 )
 FARTHEST_M = 100_000.0
-"""Largest distance between landmarks of one table; larger ones are typing mistakes."""
+"""Largest distance between landmarks of one table; larger distances are typing mistakes."""
 
 
 def read_landmarks(path: str | Path, *, rate_hz: float | None = None, clock_offset_s: float = 0.0) -> Landmarks:

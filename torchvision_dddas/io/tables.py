@@ -154,7 +154,7 @@ class TextFiles:
                 file.write(text)
 
     def close(self) -> None:
-        """Move the files to their places, including unchanged ones. Raise OSError if they cannot be written."""
+        """Move all files, also unchanged files, to their places. Raise OSError if they cannot be written."""
         for file, part in zip(self._open(), self._parts, strict=True):
             with part.naming():
                 file.close()

@@ -255,7 +255,7 @@ class StatusWriter:
         self._is_written(RUN_JSON, lambda: self._log.write_state(self.state, facts))
 
     def _is_written(self, name: str, write: Callable[[], object]) -> bool:
-        """Write a file. Only a new refusal becomes an event; otherwise each failed event would cause another one."""
+        """Write a file. Only a new refusal becomes an event; otherwise each failed event would cause another."""
         before = set(self._failing.values())
         try:
             write()

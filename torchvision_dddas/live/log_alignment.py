@@ -26,7 +26,7 @@ def describe_log(log: Telemetry, is_recording: bool, now_utc_s: float, clock_off
     """Return a note on how a log is aligned with the pictures of a live run.
 
     now_utc_s: seconds since 1970 at the first picture. Raise InputError for a log from another time, because its places
-    would be sent as current ones.
+    would be sent as current places.
     """
     has_clock = isfinite(log.start_utc_s)
     if is_recording:

@@ -246,7 +246,7 @@ class Gradient:
     def __call__(self, planes: np.ndarray) -> np.ndarray:
         """Return (2, H, W) float32: the gradient's magnitude, and magnitude x direction in radians.
 
-        planes: (C, H + 2, W + 2) uint8. Each pixel takes the channel of largest magnitude, the first one if equal. The
+        planes: (C, H + 2, W + 2) uint8. Each pixel takes the first channel of largest magnitude. The
         result is valid until the next call.
         """
         height, width = planes.shape[1] - 2, planes.shape[2] - 2

@@ -136,7 +136,7 @@ def assemble_files(
     backend: str,
     clip: str,
 ) -> Assembly:
-    """Assemble a run from the files beside a clip. given: None: locate nothing. Raise InputError for bad input."""
+    """Assemble a run from the files beside a clip. Without `given`, locate nothing. Raise InputError for bad input."""
     flight, of = None, source if isinstance(source, JoinedSource) else clip
     reason = "neither --telemetry nor --landmarks were given"
     if given is not None and given.landmarks is None:

@@ -16,7 +16,7 @@ from torchvision_dddas.types import Source
 
 
 def open_uav(path: str | Path, settings: Settings, backend: str) -> FurtherUav:
-    """Open a further UAV by its file. settings: the run's. Raise InputError for bad files or without places."""
+    """Open a further UAV by its file. settings: of the run. Raise InputError for bad files or without places."""
     file = read_aerial_platform(path)
     source = open_source(file.clip, rate_hz=file.rate_hz, full_scale=_own(file, settings).levels.given)
     table = None if file.detections is None else read_for_clip(file.detections, None, source)

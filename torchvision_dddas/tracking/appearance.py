@@ -60,7 +60,7 @@ def strip_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     place = start[:, :, None, None] + _FIRST_BIN + (lab * _BINS >> 8)
     weights = np.broadcast_to(weight[:, None, :, None], place.shape)
     counts = np.bincount(place.ravel(), weights.ravel(), count * SIGNATURE).reshape(count, 3, _STRIP_BINS)
-    # Normalise each strip first, so that a partly visible strip has the same weight as a whole one.
+    # Normalise each strip first, so that a partly visible strip has the same weight as a whole strip.
     return _normalize(_normalize(counts).reshape(count, SIGNATURE)).astype(np.float32)
 
 
@@ -71,7 +71,7 @@ def _normalize(counts: np.ndarray) -> np.ndarray:
 
 
 def similarity(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the (N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN for unknown ones (zeros)."""
+    """Return the (N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN for zeros (unknown)."""
     is_known = np.any(signature, axis=1)[:, None] & np.any(other, axis=1)
     return np.where(is_known, np.sqrt(signature) @ np.sqrt(other).T, np.nan)
 
@@ -104,7 +104,7 @@ def ambiguity(score: np.ndarray, signature: np.ndarray) -> str:
 def blend_histograms(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:
     """Update (N, D) histograms of tracks with one detection each, weighted by the visible share of the detection.
 
-    hits: (N,) detections so far, including this one. The first few histograms are averaged; later the older ones decay.
+    hits: (N,) detections so far, with this one. The first few histograms are averaged; later, older histograms decay.
     """
     gain = np.maximum(0.2, 1 / hits) * visible**2
     gain = np.where(np.any(signature, axis=1), np.where(np.any(seen, axis=1), gain, 0.0), 1.0)[:, None]

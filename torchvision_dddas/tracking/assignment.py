@@ -95,7 +95,7 @@ def choose_links(
             answer[chosen] = True
         if bound - best < _CLOSE * max(1.0, best):
             break
-        # Find the detection that each free node wants most, the first one if equal.
+        # Find the detection that each free node wants most, the first detection if equal.
         dearest = (is_left & (net > 0) & (net == most[row])).nonzero()[0]
         wanted = column[dearest[_run_starts(row[dearest])]]
         excess = np.bincount(wanted, minlength=len(price)) - 1
@@ -285,7 +285,7 @@ def _search(held: list[list[int]], gain: list[float]) -> list[int] | None:
             # A column has up to three nodes. Lowering each by a third of the excess keeps the sum above the gain.
             level -= np.maximum(least, 0.0) / 3
         price = dict(zip(price, level.tolist(), strict=True))
-    # If the group has only one node in each layer, all columns of several nodes exclude each other: take the best one.
+    # If the group has only one node in each layer, all columns of several nodes exclude each other: take the best.
     if len({node % 3 for node in price}) == len(price) and min(map(len, held)) > 1:
         return [gain.index(max(gain))]
     return least_loss(held, gain, price, _SEARCH_STEPS)

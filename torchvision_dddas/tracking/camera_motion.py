@@ -55,7 +55,7 @@ class CameraMotion:
         self._age = 0  # number of pictures since the anchor
 
     def update(self, image: np.ndarray) -> tuple[np.ndarray | None, str]:
-        """Return the (3, 3) pixel homography from the previous picture to this one, and a cause if it is unknown.
+        """Return the (3, 3) pixel homography from the previous picture to this picture, and a cause if it is unknown.
 
         The homography is None if the camera stood still (with an empty cause) or if the motion is unknown.
         """

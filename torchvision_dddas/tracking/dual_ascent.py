@@ -46,10 +46,10 @@ _SHORTLIST = 60  # triplets per target, those with the smallest losses, that the
 _SEARCH_STEPS = 20_000
 _SAME = 1e-9  # bound and value count as equal if they differ by less, in units of the largest gain
 # Length of subgradient steps as a share of Polyak's. It is multiplied by _SHRINK after _PATIENCE steps without a lower
-# bound. _MOMENTUM is the share of the last direction in the next one; it reduces zigzags.
+# bound. _MOMENTUM is the share of the last direction in the next direction; it reduces zigzags.
 _STEP, _SHRINK, _PATIENCE, _MOMENTUM = 0.4, 0.7, 4, 0.4
 # Triplets per target that enter the rounding: whole triplets, and pairs with each other layer. They are counted
-# separately, because triplets with equal dummies would crowd out the whole ones.
+# separately, because triplets with equal dummies would crowd out whole triplets.
 _PER_TARGET = np.array([4, 2, 2])
 _LOWERINGS = 4  # number of two-frame assignments that lower the first prices
 

@@ -469,7 +469,7 @@ class SourceTracker:
                 dispersions = found.location_dispersion, found.appearance_dispersion
                 use = explain_weight(window, found.weight, *dispersions, self.parameters)
             # A target takes the identity from its newest link: from frame i to j, or to k if j is the dummy. If another
-            # target has already taken that identity through a link to j, this target gets a new one.
+            # target has already taken that identity through a link to j, this target gets a new identity.
             for older, known in enumerate(self.identities, 1):
                 direct = (rows[:, 0] > 0) & (rows[:, older] > 0) & (rows[:, 1:older] == 0).all(axis=1)
                 taken = known[rows[direct, older] - 1]

@@ -31,7 +31,7 @@ from torchvision_dddas.types import (
     is_sampled,
 )
 
-_MOST_CLASSES = 10_000  # number of identities whose class is kept; the ones seen longest ago are dropped
+_MOST_CLASSES = 10_000  # number of identities whose class is kept; those seen longest ago are dropped
 _TRIED = 100  # number of boxes from arrays that are checked for their order of coordinates
 MOTION = "moving"
 """The kind of the motion detector's detections."""
@@ -116,7 +116,7 @@ class Tracker:
         usual interval. time_s: time of the frame, if the frame rate is not constant; it is used for prediction.
         damaged: see Frame; targets that first appear in a damaged frame need more detections.
         Raises InputError for other shapes, boxes without a size, values that are not finite, and a frame number that is
-        not above the last one.
+        not above the last number.
         """
         is_moving = isinstance(detections, Detections) and detections.kind == MOTION
         is_array = not isinstance(detections, Detections)

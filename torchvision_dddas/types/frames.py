@@ -142,7 +142,7 @@ def is_sampled(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
 
 @dataclass(frozen=True)
 class Registration(Record):
-    """The background's motion from one frame to a later one.
+    """The background's motion from one frame to a later frame.
 
     later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
     tracked, inliers: numbers of keypoints tracked, and of inliers, which fit the homography.

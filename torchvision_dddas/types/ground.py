@@ -14,7 +14,7 @@ class Camera(Record):
     """A camera above the ground, with standard deviations (sigma).
 
     size_px: (width, height). focal_px: along u and v. centre_px: u, v of the optical axis. k1, k2, k3: OpenCV's
-    radial distortion; p1, p2: its tangential one. place: longitude and latitude in degrees if
+    radial distortion; p1, p2: its tangential distortion. place: longitude and latitude in degrees if
     geographic, else local metres east and north.
     heading_rad: clockwise from true north. pitch_rad: below the horizon. roll_rad: clockwise, seen from behind.
     height_m: above ground, NaN if unknown. focal_sigma: relative. position_sigma_m: east and north each.

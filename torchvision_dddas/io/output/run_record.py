@@ -74,7 +74,7 @@ class Spans:
     def add(self, frame: int, before: int, text: str, **cells: Any) -> None:
         """Add a remark on a frame, or extend the row of an equal remark on the frame before it.
 
-        before: the number of the frame before this one. cells: further columns of the row.
+        before: the number of the frame before this frame. cells: further columns of the row.
         """
         key = text if self._is_exact else without_numbers(f"{text} {cells}")
         row = self._open.get(key)

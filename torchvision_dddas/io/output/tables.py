@@ -328,7 +328,7 @@ def pair_table(folder: Path) -> TableFiles[SharedFrame]:
 
 
 def map_table(folder: Path) -> TableFiles[SharedFrame]:
-    """Open maps.csv: the homography from a view to the other view, row by row, at each moment with a known one."""
+    """Open maps.csv: the homography from a view to the other view, row by row, at each moment with a known map."""
     terms = [f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
     whole = [Column(name, "d") for name in ("moment", "view", "other_view")]
     schema = Schema("maps", *whole, Column("quality", ".3f"), *(Column(name, ".9g") for name in terms))

@@ -301,7 +301,7 @@ def _restarts(values: np.ndarray) -> list[int]:
 
 
 def sort_flights(log: Log, time_s: np.ndarray) -> None:
-    """Let a log be sorted by time if a whole flight stands after a later one."""
+    """Let a log be sorted by time if a whole flight stands after a later flight."""
     if rows := _restarts(time_s):
         spans = sorted((np.nanmin(part), np.nanmax(part)) for part in np.split(time_s, rows))
         log.jitter_s = math.inf if all(before[1] < after[0] for before, after in pairwise(spans)) else log.jitter_s

@@ -232,7 +232,7 @@ def _place(gps: Numbers, is_swapped: bool, has_height: bool) -> dict[str, float]
 
 
 def _note_lacking(log: Log, lacking: dict[str, list[int]], last: int, count: int) -> None:
-    """Note quantities that some subtitles lack and earlier ones have. last: line of the last of `count` subtitles."""
+    """Note quantities that some subtitles lack but earlier ones have. last: line of the last of `count` subtitles."""
     together: dict[tuple[int, ...], list[str]] = {}
     for name, lines in lacking.items():
         together.setdefault(tuple(lines), []).append(name)

@@ -263,7 +263,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
 
     overrides: changes such as `uav.altitude_m=80` or `crowd.1.people=20`. seed: replaces the scenario's own seed. Files
     that the scenario names are searched for in its folder first, then in the working directory.
-    Raises InputError for an unknown scenario (lists the known ones), invalid TOML, an unknown parameter (suggests the
+    Raises InputError for an unknown scenario (lists known scenarios), invalid TOML, an unknown parameter (suggests the
     nearest), a value outside its range, and a scenario that `check_scenario` rejects.
     """
     path = Path(name_or_path)

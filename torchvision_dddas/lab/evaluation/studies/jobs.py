@@ -44,7 +44,7 @@ NO_WORKER_S = 30.0
 """Longest time that a scheduler may be without workers."""
 
 SILENT_S = 60.0
-"""A local worker that gives no sign for this time, for example a stopped one, is replaced. Its clip starts again."""
+"""A local worker that gives no sign for this time, for example a stopped worker, is replaced. Its clip starts again."""
 
 _POLL_S = _REPORT_S = 0.25
 _TOPIC = "dddas-frames"
@@ -206,7 +206,7 @@ class Workers:
     """The processes that do jobs, each on one thread. A context manager: they end with the block.
 
     jobs: their number; 1 is this process; None is one for each core, or 1 without Dask. scheduler: address of a Dask
-    scheduler whose workers replace the local ones. Local workers start when they are first needed. silent_s: a local
+    scheduler whose workers replace local workers. Local workers start when they are first needed. silent_s: a local
     worker that gives no sign for this time counts as dead; a scheduler has its own limit. Raise InputError if Dask is
     needed but not installed, or if the scheduler does not answer.
     """
