@@ -33,7 +33,7 @@ from torchvision_dddas.types import (
     Sightings,
 )
 
-# Rounds in which the sightings of each vehicle are matched again to those of the others.
+# Rounds in which the sightings of each vehicle are matched again to the other vehicles' sightings.
 _ROUNDS = 3
 # Cameras whose ground heights differ by less than this stand on one plane.
 _LEVEL_M = 0.5

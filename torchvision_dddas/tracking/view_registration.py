@@ -56,7 +56,7 @@ def score_pairs(b_from_a: np.ndarray, a: ViewTargets, b: ViewTargets, wider: flo
     square = spread[..., 1, 1] * off[..., 0] ** 2 + spread[..., 0, 0] * off[..., 1] ** 2
     square = (square - 2 * spread[..., 0, 1] * off[..., 0] * off[..., 1]) / determinant
     apart = np.square(b.place[:, None] - b.place[None]).sum(-1)
-    # The density of chance matches is the density of b within 4.2 box sizes, or in metres within the mean spacing of b.
+    # Chance matches are as dense as the targets of b within 4.2 box sizes, or in metres within their mean spacing.
     share = np.prod(np.ptp(b.place, axis=0)) / len(b.place) + 1e-9
     reach = np.full(len(b.place), share) if _is_metric(a) else 18 * b.size**2
     density = (apart < reach[:, None]).sum(1) / (np.pi * reach)
