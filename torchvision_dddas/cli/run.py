@@ -59,7 +59,12 @@ def run(
     ] = None,
     telemetries: Annotated[
         list[Path] | None,
-        typer.Option("--telemetry", metavar="FILE", help=f"{REPORTS} Of several clips one of each, or one of all."),
+        typer.Option(
+            "--telemetry",
+            metavar="FILE",
+            help=f"{REPORTS} Of several clips one of each, or one of all. With --live also as it comes: "
+            "a growing CSV, a FIFO, -, klv, udp:, nmea:, gpsd:, mavlink:",
+        ),
     ] = None,
     colours: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The TOML of the landmarks' colours, by `dddas colours`.")
@@ -200,6 +205,11 @@ def run(
         others = {"--emit": emit, "--serve": serve, "--serve-token": serve_token, "--command": command}
         others |= {"--people": people or None, "--wait": wait or None}
         refuse_options({**others, **limits}, "is for a run that keeps up with a camera; give --live too")
+        for file in (file for file in (*logs, landmarks) if file is not None and not file.exists()):
+            from torchvision_dddas.live import is_live_input
+
+            if is_live_input(str(file)):
+                raise InputError(f"{file} comes live, beside a camera or a stream; give --live, or a file")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--geoid": geoid, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--ignore": ignore, **beside}

@@ -3,7 +3,7 @@
 from torchvision_dddas.geo.aerial_locator import AerialLocator, check_table, frames_to_locate, is_outside
 from torchvision_dddas.geo.aerial_targets import Targets, tracked_targets
 from torchvision_dddas.geo.camera_calibration import calibrate_focal_length, calibrate_pose
-from torchvision_dddas.geo.clock_offset import describe_clock_offset
+from torchvision_dddas.geo.clock_offset import describe_clock_offset, measure_clock_offset
 from torchvision_dddas.geo.colours import CalibratedColours, calibrate_colours, draw_calibration
 from torchvision_dddas.geo.flight_calibration import (
     OFFSETS,
@@ -14,6 +14,7 @@ from torchvision_dddas.geo.flight_calibration import (
     estimate_flight_errors,
     find_looks,
 )
+from torchvision_dddas.geo.flight_prediction import predict_flight
 from torchvision_dddas.geo.fusion import TargetFusion
 from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.geo.heading_offset import describe_heading_offset, find_heading_offset
@@ -32,6 +33,7 @@ from torchvision_dddas.geo.site import (
     Site,
     build_site,
     complete_site,
+    complete_telemetry,
     describe_no_place,
     describe_unknown_heights,
     has_places,
@@ -62,6 +64,7 @@ __all__ = [
     "check_colours",
     "check_table",
     "complete_site",
+    "complete_telemetry",
     "describe_clock_offset",
     "describe_heading_offset",
     "describe_no_place",
@@ -76,7 +79,9 @@ __all__ = [
     "has_places",
     "is_outside",
     "load_solver",
+    "measure_clock_offset",
     "pose_prior",
+    "predict_flight",
     "range_people",
     "resolve_camera",
     "to_local",

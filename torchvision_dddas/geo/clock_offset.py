@@ -32,10 +32,27 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
 
     seen: time of each frame, s, and (3, 3) pixel homography from the frame before, NaN if unknown.
     """
+    if (found := measure_clock_offset(locator, seen)) is None:
+        return ""
+    offset_s, sigma_s = found
+    when = f"{abs(offset_s):.3f} s {'later' if offset_s > 0 else 'earlier'} in the pictures than in the log"
+    return (
+        f"{locator.rate_warning}log and clip are not synchronised: the camera turns {when} (sigma {sigma_s:.3f} s); "
+        f"set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
+    )
+
+
+def measure_clock_offset(
+    locator: AerialLocator, seen: Sequence[tuple[float, np.ndarray]]
+) -> tuple[float, float] | None:
+    """Return the seconds to add to the log's times, and their standard deviation; None if aligned or not known.
+
+    seen: as in `describe_clock_offset`.
+    """
     telemetry, camera = locator.site.telemetry, locator.camera
     # A heading from the course, or from the nose of a vehicle with a gimbal, does not turn with the camera.
     if telemetry is None or telemetry.heading_from or len(seen) < _LEAST:
-        return ""
+        return None
     (fu, fv), (u, v) = camera.focal_px, camera.centre_px
     pixel_from_ray = np.array([[fu, 0, u], [0, fv, v], [0, 0, 1]])
     time_s, motion = np.array([time for time, _ in seen]), np.array([motion for _, motion in seen])
@@ -43,13 +60,8 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
     found = find_clock_offset(time_s, turned, telemetry.time_s, logged_turns(telemetry, locator.site.elevation))
     # The time of a picture is known only to within half a frame interval.
     if found is None or abs(found[0]) <= max(3 * found[1], float(np.median(np.diff(time_s))) / 2):
-        return ""
-    offset_s, sigma_s = found[0], max(found[1], 0.001)
-    when = f"{abs(offset_s):.3f} s {'later' if offset_s > 0 else 'earlier'} in the pictures than in the log"
-    return (
-        f"{locator.rate_warning}log and clip are not synchronised: the camera turns {when} (sigma {sigma_s:.3f} s); "
-        f"set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
-    )
+        return None
+    return found[0], max(found[1], 0.001)
 
 
 def logged_turns(telemetry: Telemetry, elevation: Elevation | None = None) -> Float[np.ndarray, "N 3"]:

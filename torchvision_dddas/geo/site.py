@@ -145,7 +145,7 @@ def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tupl
     if settings.aerial.geoid and math.isnan(geoid_m):
         notes.append("aerial.geoid is not used: in local metres the geoid's height is unknown")
     if site.telemetry is not None:
-        site, more = _complete_telemetry(site, site.telemetry, camera, settings)
+        site, more = complete_telemetry(site, site.telemetry, camera, settings)
         notes += more
     elif camera is not None and (keys := known_keys(camera)):
         notes.append(f"{', '.join(keys)} of the camera are not used: give --telemetry")
@@ -161,9 +161,13 @@ def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tupl
     return replace(site, plane_above_sea_m=plane_m), notes
 
 
-def _complete_telemetry(
+def complete_telemetry(
     site: Site, telemetry: Telemetry, camera: Camera | None, settings: Settings
 ) -> tuple[Site, list[str]]:
+    """Return the site with this telemetry, its gaps filled as in `complete_site`, and notes.
+
+    site: with its geoid and settled landmarks. telemetry: in the site's local metres. Raise InputError as that does.
+    """
     has_level = bool(np.isfinite(site.landmarks.elevation_m).any()) and settings.aerial.mode == "pose"
     has_takeoff = camera is not None and camera.knows("takeoff_above_sea_m")
     has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0

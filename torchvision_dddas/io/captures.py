@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
@@ -92,7 +93,8 @@ class AvCapture:
     Pictures keep the size in which they were sent. If there are several video streams, the first that is not a cover is
     read. concealed: whether the last grabbed picture has errors that the decoder concealed, or damaged data. damaged:
     whether the picture may depend on a concealed picture: until the next key frame, or for _HEALED pictures.
-    stored: number of pictures in the data read so far, whether or not they can be decoded.
+    stored: number of pictures in the data read so far, whether or not they can be decoded. metadata: time stamps and
+    contents of the newest KLV packets, which the reader takes out; None unless it is a live stream that announces KLV.
     Raise ImportError if PyAV is not installed.
     """
 
@@ -126,7 +128,10 @@ class AvCapture:
         np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
         form = self._video.format if limits_s is None else None
         self._is_deep = form is not None and form.name.startswith("gray") and form.bits_per_pixel > 8
-        self._packets: Iterator[Any] = self._container.demux(self._video)
+        klv = [] if limits_s is None else [one for one in self._container.streams.data if one.name == "klv"]
+        self.metadata = deque[tuple[float, bytes]](maxlen=256) if klv else None
+        self._read_streams = [self._video, *klv]
+        self._packets: Iterator[Any] = self._container.demux(*self._read_streams)
         self._waiting: list[Any] = []  # frames of the last packet
         self._spoiled: set[int | None] = set()  # time stamps of damaged packets
         self._frame: Any = None
@@ -144,8 +149,16 @@ class AvCapture:
             except StopIteration:
                 return False
             except self._failures:
-                self._packets = self._container.demux(self._video)  # a generator that raised has ended
+                self._packets = self._container.demux(*self._read_streams)  # a generator that raised has ended
                 return False
+            if packet.stream is not self._video:
+                # A packet without a time stamp belongs to the picture before it.
+                stamp_s = (
+                    self.get(cv2.CAP_PROP_POS_MSEC) / 1000 if packet.pts is None else packet.pts * packet.time_base
+                )
+                if packet.size and self.metadata is not None:
+                    self.metadata.append((float(stamp_s), bytes(packet)))
+                continue
             self.stored += packet.size > 0
             if packet.is_corrupt:
                 self._spoiled.add(packet.pts)

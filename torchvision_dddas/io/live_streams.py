@@ -1,7 +1,9 @@
 """Read live streams picture by picture. The camera or the sender may stop sending at any time."""
 
+from collections import deque
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
@@ -52,6 +54,16 @@ class OpenedStream:
     def damaged(self) -> bool:
         """Whether the last grabbed picture has concealed errors or may depend on such a picture."""
         return getattr(self._capture, "damaged", False)
+
+    @property
+    def metadata(self) -> deque[tuple[float, bytes]] | None:
+        """Time stamps (s) and contents of the newest KLV packets, which the reader takes out; None without any."""
+        return getattr(self._capture, "metadata", None)
+
+    @property
+    def stamp_s(self) -> float:
+        """Time stamp of the last grabbed picture; NaN for none."""
+        return self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
 
     def grab(self) -> bool:
         """Wait for the next picture. Return False if none came."""

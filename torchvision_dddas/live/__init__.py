@@ -3,6 +3,7 @@
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.commanding import CommandOptions
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.report_inputs import is_live_input
 from torchvision_dddas.live.runner import LoadShedding
 from torchvision_dddas.live.session import run_live
 
@@ -11,5 +12,6 @@ __all__ = [
     "Health",
     "LiveSource",
     "LoadShedding",
+    "is_live_input",
     "run_live",
 ]

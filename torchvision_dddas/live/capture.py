@@ -1,6 +1,7 @@
 """Live capture: a thread reads a camera, a stream or a recording at its own pace."""
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -105,6 +106,11 @@ class LiveSource:
     def problems(self) -> list[Problem]:
         """The latest 64 problems."""
         return self._log.problems
+
+    @property
+    def metadata(self) -> deque[tuple[float, bytes]] | None:
+        """Times of day, by the clock of the pictures, and contents of the newest KLV packets; None without any."""
+        return getattr(self._feed, "metadata", None)
 
     def look_at(self, every: int) -> None:
         """From now on yield one of `every` frames; the others are left out on purpose."""

@@ -1,6 +1,7 @@
 """Read a camera or stream that may stop sending, hang or change its size, and reopen it when it is lost."""
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -23,6 +24,7 @@ _OFF = 0.2  # relative error of the announced rate that is reported
 _MOST_HUNG = 3  # threads that may hang in a driver, which cannot be ended
 _MEASURED = 12  # pictures from which an unannounced rate is measured
 _FALLBACK_HZ = 10.0  # rate if these pictures come all at once
+_STAMPS = 25  # pictures whose median gives the time of day of time stamps
 
 
 _WAITING_S = 1.0  # interval between calls of `waiting`
@@ -40,7 +42,8 @@ class Receiver:
     """Read a stream in a thread of its own from the start, and fill the queue once frames are taken.
 
     rate_hz: the given rate, else the announced rate, else the measured rate. size: size of the first picture; it
-    changes with the stream. waiting: as in LiveSource. Raise InputError if no first picture comes.
+    changes with the stream. metadata: as in LiveSource; the time of a packet is the time at which a picture with its
+    time stamp came. waiting: as in LiveSource. Raise InputError if no first picture comes.
     """
 
     def __init__(
@@ -70,6 +73,8 @@ class Receiver:
         self._start_s = float("nan")
         self._odd_s: float | None = None  # time since which pictures differ from `size`; None: they do not
         self._off = False  # whether a wrong announced rate was reported
+        self.metadata: deque[tuple[float, bytes]] | None = None
+        self._behind_s: deque[float] = deque(maxlen=_STAMPS)  # time of day minus time stamp of the latest pictures
         self.threads: list[threading.Thread] = []
         self._at_work: threading.Thread | None = None  # the current thread; None if all hang
         self._spawn()
@@ -178,6 +183,7 @@ class Receiver:
         try:
             with self._driver(turn, OPENING):
                 stream = self._opener()
+            self._behind_s.clear()  # the time stamps of another connection begin anew
             if not self._ready:
                 with self._driver(turn, OPENING):
                     image = first_picture(stream, self.name)
@@ -186,6 +192,8 @@ class Receiver:
                     if turn != self._turn:
                         raise _GivenUp
                     self.size, self.rate_hz, self._ready = (image.shape[1], image.shape[0]), rate_hz, True
+                    if getattr(stream, "metadata", None) is not None:
+                        self.metadata = deque(maxlen=256)
                     self._found()
                     self._queue.changed.notify_all()
             why = self._read(stream, turn)
@@ -249,7 +257,9 @@ class Receiver:
                 continue
             failed, came_s = 0, self._clock.now()
             taken_s = came_s
-            if self._picture(stream, taken_s):
+            is_good = self._picture(stream, taken_s)
+            self._take_metadata(stream, taken_s)
+            if is_good:
                 good_s = taken_s
             elif taken_s - good_s > self._parameters.stall_s:
                 return f"none of its pictures could be decoded for {taken_s - good_s:.1f} s"
@@ -284,6 +294,20 @@ class Receiver:
             damaged = getattr(stream, "damaged", False)
             self._queue.put(Frame(log.number, (log.number - 1) / rate_hz, image, 0, taken_s, damaged))
         return True
+
+    def _take_metadata(self, stream: LiveStream, taken_s: float) -> None:
+        """Give the packets of metadata that came with a picture their times of day, by the time stamps of pictures."""
+        packets, stamp_s = getattr(stream, "metadata", None), getattr(stream, "stamp_s", np.nan)
+        if packets is None or self.metadata is None:
+            return
+        shown_s = self._clock.utc() - self._clock.now() + taken_s
+        if self._queue.begun:  # the time that the picture has for the run
+            shown_s = self._log.start_utc_s + (self._log.number - 1) / self.rate_hz
+        self._behind_s.append(shown_s - stamp_s)
+        behind_s = float(np.nanmedian(self._behind_s)) if np.isfinite(self._behind_s).any() else np.nan
+        while packets:
+            stamp_s, content = packets.popleft()
+            self.metadata.append((shown_s if np.isnan(stamp_s + behind_s) else stamp_s + behind_s, content))
 
     def _found(self) -> None:
         """Record that pictures come."""

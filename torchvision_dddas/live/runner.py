@@ -17,9 +17,11 @@ from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.live_telemetry import LiveTelemetry
 from torchvision_dddas.live.log_alignment import align_log
 from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.watchdog import Watchdog
+from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
 
 _MOST_FAILURES = 25
@@ -37,7 +39,8 @@ class Feed:
     the telemetry. seen: is called with each frame. telemetry: a function that returns the log, as the pipeline expects
     of a source; None if there is none. clock_offset_s: the offset of the camera's clock, with which `align_log` aligns
     a log that has a clock. aligned: is called with the aligned log. locator: of the pipeline that runs now; None if
-    nothing is located.
+    nothing is located. began: is called with the pipeline that begins. live: telemetry that comes during the run, which
+    replaces the log; None without it. place_landmarks: is called before each picture.
     """
 
     count = None
@@ -55,7 +58,11 @@ class Feed:
         self.telemetry = None if telemetry is None else lambda: self.log
         self.aligned: Callable[[Telemetry], object] = lambda log: None
         self.locator: AerialLocator | None = None
+        self.began: Callable[[Pipeline], object] = lambda pipeline: None
+        self.place_landmarks: Callable[[], object] = lambda: None
         self.seen: Callable[[Frame], object] = lambda frame: None
+        self.live: LiveTelemetry | None = None
+        self._newest: Telemetry | None = None  # the latest log of `live`
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
@@ -93,23 +100,35 @@ class Feed:
             self.newest = frame
             self.seen(frame)
             self._read_log(frame)
+            self.place_landmarks()
             self._watchdog.begin(frame.number)
             yield frame
 
     def _read_log(self, frame: Frame) -> None:
-        """Align the log with the first picture, again whenever the machine's clock was set; report its gaps."""
+        """Align the log with the first picture, again whenever the machine's clock was set; report its gaps.
+
+        Live telemetry replaces the log by its newest record first.
+        """
         if self.log is None:
             return
+        live, tolerance_s = self.live, 1.0
+        if live is not None and live.log is not None:
+            tolerance_s = self.log.hold_s  # the record is continued already, so nothing more holds
+            if live.log is not self._newest:
+                self._newest = self.log = live.log
+                self.clock_offset_s, self._start_utc_s = live.clock_offset_s, nan
         if isfinite(self.log.start_utc_s + self.clock_offset_s) and self._source.start_utc_s != self._start_utc_s:
             self._start_utc_s = self._source.start_utc_s
             self.log = align_log(self.log, self._start_utc_s, self.clock_offset_s)
             self.aligned(self.log)
-        flight = self.log.at(frame.time_s)
+        flight = self.log.at(frame.time_s, tolerance_s=tolerance_s)
         silent = flight is None or (self._has_altitude and not isfinite(flight.altitude_m))
         if silent != self._silent:
             self._silent = silent
-            has_ended = silent and frame.time_s > self.log.time_s[-1]
-            words = f"telemetry is {'silent' if silent else 'there again'}{': its log has ended' if has_ended else ''}"
+            ended = ": its log has ended" if silent and frame.time_s > self.log.time_s[-1] else ""
+            if ended and live is not None and live.raw is not None:
+                ended = live.describe_silence(self._start_utc_s + frame.time_s)
+            words = f"telemetry is {'silent' if silent else 'there again'}{ended}"
             self._health.event("telemetry", words, frame.number)
             self._health.trouble("telemetry", words if silent else "")
 

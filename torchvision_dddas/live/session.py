@@ -33,9 +33,12 @@ from torchvision_dddas.live.access import choose_access
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.commanding import CommandOptions, open_commands
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
+from torchvision_dddas.live.live_landmarks import open_landmarks
+from torchvision_dddas.live.live_telemetry import LiveTelemetry, open_telemetry
 from torchvision_dddas.live.log_alignment import describe_landmarks, describe_log
 from torchvision_dddas.live.operator_view import OperatorView
 from torchvision_dddas.live.receiver import DeadCamera
+from torchvision_dddas.live.report_inputs import KLV
 from torchvision_dddas.live.runner import (
     Feed,
     LoadShedding,
@@ -49,10 +52,18 @@ from torchvision_dddas.live.server import HealthServer, Page, health_pages, pars
 from torchvision_dddas.live.team import LiveTeam
 from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
-from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, locator_facts, map_site
+from torchvision_dddas.pipeline import (
+    AerialInput,
+    Assembly,
+    Pipeline,
+    assemble_files,
+    completion,
+    locator_facts,
+    map_site,
+)
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
-from torchvision_dddas.types import Adjustment, Frame, FrameResult
+from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry
 
 _WAITING = "waiting for the camera"
 _CLEAR = "\r\x1b[K"
@@ -140,7 +151,29 @@ def run_live(
         health.begin()
         if source.recorded is not None:
             check_length(source.recorded)
-        prepare = partial(assemble_files, given, telemetry, settings, source, backend, clip)
+        reports = open_telemetry(telemetry, source, settings.aerial, health)
+        is_awaited = reports is not None and reports.is_awaited
+        if reports is not None:
+            stack.callback(reports.close)
+            if is_awaited:
+                reports.wait(waiting if wait else None)
+                given = replace(given or AerialInput(), telemetry=Path(reports.name))
+
+        marks = open_landmarks(None if given is None else given.landmarks, source, health)
+        if marks is not None:
+            stack.callback(marks.close)
+            marks.wait(waiting if wait else None)
+
+        def prepare() -> Assembly:
+            """Assemble the run with its files, or with the newest reports."""
+            newest, log = given, telemetry if reports is None or reports.raw is None else reports.record()
+            if newest is not None and isinstance(log, Telemetry):
+                newest = replace(newest, telemetry=log)
+            if newest is not None and marks is not None:
+                start_utc_s = time.time() if isnan(source.start_utc_s) else source.start_utc_s
+                newest = replace(newest, landmarks=marks.record(start_utc_s, source.rate_hz))
+            return assemble_files(newest, log, settings, source, backend, clip)
+
         ready = prepare()
         ready.notes.extend([str(source.levels)] if source.levels else [])
         ready.notes.extend(detector.notes if detector is not None else ())
@@ -148,9 +181,11 @@ def run_live(
         site = None if ready.watch is None else ready.watch.locator.site
         if zones is not None:
             zones.check(site is not None, None if site is None else site.origin_deg)
-        if flight is not None:
+        if reports is not None and is_awaited:
+            ready.notes.append(f"the telemetry comes live from {reports.name}, and is aligned by the clock")
+        elif flight is not None:
             ready.notes.append(describe_log(flight, is_recording, time.time(), offset_s))
-        if site is not None and not is_recording:
+        if site is not None and not is_recording and marks is None:
             ready.notes.extend(describe_landmarks(site.landmarks))
         team = LiveTeam((ground, aerial), settings, backend, ready.watch, source, health) if ground or aerial else None
         commands = None
@@ -173,7 +208,7 @@ def run_live(
         streams = _open(opened, [f"json:{folder / RESULTS}"], about, health, live, "--out") + streams
         facts: dict[str, Any] = {
             "input": name,
-            "telemetry": telemetry,
+            "telemetry": telemetry if reports is None else reports.name,
             "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
             "interval_frames": interval,
             "people": people,
@@ -197,6 +232,13 @@ def run_live(
 
         feed = Feed(source, health, watchdog, flight)
         feed.clock_offset_s = nan if is_recording else offset_s
+        if reports is not None and not is_recording:
+            feed.live, reports.clock_offset_s = reports, offset_s
+            feed.began = partial(_follow, reports, feed, given, settings, ready.notes)
+        if marks is not None:
+            feed.place_landmarks = lambda: marks.place(
+                feed.locator, source.start_utc_s - feed.clock_offset_s, source.rate_hz
+            )
         if server is not None:
             ground_site = None if ready.watch is None else map_site(ready.watch.locator, None)
             view.begin(interval, about, ground_site, zones.zones if zones else ())
@@ -263,6 +305,23 @@ def run_live(
     if failure or refused:
         return HUNG if failure else UNWRITTEN
     return 0 if signals.signal in (None, signal.SIGTERM) else 128 + signals.signal
+
+
+def _follow(
+    reports: LiveTelemetry,
+    feed: Feed,
+    given: AerialInput | None,
+    settings: Settings,
+    notes: Sequence[str],
+    pipeline: Pipeline,
+) -> None:
+    """Complete live reports for the site of the locator; estimate the clock offset, unless it is given or known."""
+    if (locator := feed.locator) is None:
+        reports.begin(lambda log: (log, []), notes)
+        return
+    reports.begin(completion(given, settings, locator), notes)
+    if not is_set(settings, "aerial.clock_offset_s") and reports.name != KLV:
+        reports.measure = lambda: reports.estimate_clock_offset(locator, pipeline.motions)
 
 
 class _Located:
@@ -355,6 +414,7 @@ def build_path(
             detector=detector,
             movers=movers,
         )
+        feed.began(pipeline)
         for result in pipeline(feed):
             yield result, None if person_tracker is None else person_tracker.people_of(result.number, feed.ended)
 

@@ -6,7 +6,7 @@ be steered. Commands, live runs, studies, the simulator and tuning all use these
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,11 +25,13 @@ from torchvision_dddas.geo import (
     build_site,
     check_colours,
     complete_site,
+    complete_telemetry,
     describe_no_place,
     describe_unknown_heights,
     has_places,
     load_solver,
     resolve_camera,
+    to_local,
     without_pixels,
 )
 from torchvision_dddas.io.camera_files import read_aerial_camera
@@ -45,10 +47,13 @@ from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Scene
 
 @dataclass(frozen=True)
 class AerialInput:
-    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as in the options of `dddas locate`."""
+    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as in the options of `dddas locate`.
 
-    landmarks: Path | None = None
-    telemetry: Path | None = None
+    landmarks, telemetry: records, if they do not come from files.
+    """
+
+    landmarks: Path | Landmarks | None = None
+    telemetry: Path | Telemetry | None = None
     camera: Path | None = None
     dem: Path | None = None
     background: Path | None = None
@@ -57,7 +62,7 @@ class AerialInput:
     @property
     def files(self) -> list[Path]:
         """All files that are given."""
-        return [file for file in vars(self).values() if file is not None]
+        return [file for file in vars(self).values() if isinstance(file, Path)]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -130,7 +135,7 @@ def assemble_mission(source: Instrument, settings: Settings, backend: str, by_la
 
 def assemble_files(
     given: AerialInput | None,
-    telemetry: Path | None,
+    telemetry: Path | Telemetry | None,
     settings: Settings,
     source: Source,
     backend: str,
@@ -161,6 +166,24 @@ def assemble_files(
     settings, more = with_logged_focal(settings, flight, source.size)
     notes = [*(flight.notes if flight is not None else ()), *more, *_rate_notes(source), f"{NONE_LOCATED}{reason}"]
     return Assembly(settings, load_engine(backend, settings), flight, notes=notes)
+
+
+def completion(
+    given: AerialInput | None, settings: Settings, locator: AerialLocator
+) -> Callable[[Telemetry], tuple[Telemetry, list[str]]]:
+    """Return a function that completes later telemetry as that of the locator's site was, and returns notes."""
+    site, size = locator.site, locator.camera.size_px
+    known = None if given is None or given.camera is None else read_aerial_camera(given.camera, size)
+
+    def complete(telemetry: Telemetry) -> tuple[Telemetry, list[str]]:
+        if telemetry.geographic != (site.origin_deg is not None):
+            raise InputError(f"{telemetry.origin}: its places are in other units than before; they are left out")
+        local = telemetry if site.origin_deg is None else to_local(telemetry, site.origin_deg)
+        completed, notes = complete_telemetry(site, local, known, settings)
+        assert completed.telemetry is not None
+        return completed.telemetry, notes
+
+    return complete
 
 
 def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
@@ -203,8 +226,10 @@ def _read_flight(
 
 
 def _read_telemetry(
-    path: Path, settings: Settings, clip: str | JoinedSource | None, rate_hz: float | None
+    given: Path | Telemetry, settings: Settings, clip: str | JoinedSource | None, rate_hz: float | None
 ) -> Telemetry:
+    if isinstance(given, Telemetry):
+        return given
     aerial = settings.aerial
 
     def read(path: Path, clip: str | None) -> Telemetry:
@@ -217,7 +242,7 @@ def _read_telemetry(
             rate_hz=rate_hz,
         )
 
-    return clip.read_logs(read) if isinstance(clip, JoinedSource) else read(path, clip)
+    return clip.read_logs(read) if isinstance(clip, JoinedSource) else read(given, clip)
 
 
 def _rate_notes(source: Source) -> list[str]:
@@ -291,9 +316,9 @@ def read_locator(
     """
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
-    landmarks = (
-        None if given.landmarks is None else read_landmarks(given.landmarks, rate_hz=rate_hz, clock_offset_s=offset)
-    )
+    landmarks = None if isinstance(given.landmarks, Path) else given.landmarks
+    if isinstance(given.landmarks, Path):
+        landmarks = read_landmarks(given.landmarks, rate_hz=rate_hz, clock_offset_s=offset)
     telemetry = _read_telemetry(given.telemetry, settings, clip, rate_hz) if given.telemetry is not None else None
     if telemetry is not None:
         if rate_hz is None:

@@ -150,6 +150,7 @@ class Pipeline:
                 raise InputError("camera, colours and elevation need landmarks, or telemetry with places")
             if telemetry is not None:
                 self.notes.append(f"nothing is located: {describe_no_place(telemetry)}")
+        self._motions: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_MOTIONS)
         self._watch: LandmarkWatch | None = None
         self._mission: Mission | None = None
         self._seen: Callable[[Scene], object] | None = None
@@ -265,8 +266,13 @@ class Pipeline:
         self._crowds = (CrowdIdentities(), CrowdEvents(join_m)) if join_m else None
         self._waiting: dict[int, WatchedScene] = {}
         self._watched: WatchedScene | None = None  # the last watched scene
-        self._motions: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_MOTIONS)
+        self._motions.clear()
         return assembly.engine
+
+    @property
+    def motions(self) -> list[tuple[float, np.ndarray]]:
+        """Time of each latest frame, s, and (3, 3) pixel homography from the frame before, NaN if unknown."""
+        return list(self._motions)
 
     def _take(self, scene: Scene) -> Iterator[FrameResult]:
         """Locate a scene's landmarks, give its targets identities, and finish the frames that the scene settles."""

@@ -10,16 +10,26 @@ from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry import dataflash, photos, px4
+from torchvision_dddas.io.telemetry.autopilots import NAMES as MAVLINK_NAMES
 from torchvision_dddas.io.telemetry.clocks import parse_time_zone
-from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
+from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, message_parts, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
+from torchvision_dddas.io.telemetry.newest import ReportWindow, kind_of_report, split_reports
 from torchvision_dddas.io.telemetry.nmea import SENTENCE, read_nmea
-from torchvision_dddas.io.telemetry.record import KINDS
+from torchvision_dddas.io.telemetry.record import KINDS, is_clock
 from torchvision_dddas.io.telemetry.tables import read_telemetry_table
 from torchvision_dddas.io.telemetry.text_logs import read_subtitles
 from torchvision_dddas.types import Telemetry
 
-__all__ = ["read_telemetry"]
+__all__ = [
+    "MAVLINK_NAMES",
+    "ReportWindow",
+    "is_clock",
+    "kind_of_report",
+    "message_parts",
+    "read_telemetry",
+    "split_reports",
+]
 
 _STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 4)}
 

@@ -23,7 +23,7 @@ _V2_MIRRORED, _SIGNED_MIRRORED = _MIRROR[_V2], _MIRROR[_SIGNED]
 _LATEST_US = 7_258_118_400_000_000  # the year 2200; a computer without a clock begins in 1970
 _PLACES = ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "GPS2_RAW")
 _OF_PARTS = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS", "CAMERA_FOV_STATUS")
-_HEARTBEAT, _SYSTEM_TIME = 0, 2
+HEARTBEAT, SYSTEM_TIME = 0, 2
 _ENOUGH = 5  # useful messages of either kind that are read from a sender
 # Kinds of senders in heartbeats (MAV_TYPE): ground stations and antenna trackers; and parts of a vehicle.
 _STATIONS, _PARTS = {5, 6}, {18, 26, 27, *range(30, 35), *range(36, 43), 44, 48}
@@ -73,7 +73,7 @@ def _mavlink_topics(log: Log) -> tuple[Topics, float]:
             continue
         first = place + (13 if content[place + 8] == _V2 else 11)
         sender = content[first], content[first + 1]
-        is_call = number in (_HEARTBEAT, _SYSTEM_TIME)
+        is_call = number in (HEARTBEAT, SYSTEM_TIME)
         if is_call and heard[sender, number] >= _ENOUGH:
             continue
         try:
@@ -81,13 +81,13 @@ def _mavlink_topics(log: Log) -> tuple[Topics, float]:
         except (dialect.MAVError, ValueError, TypeError):
             bad.append(place)
             continue
-        if number == _HEARTBEAT:
+        if number == HEARTBEAT:
             kinds[sender] = message.type
         else:
             came_s = int.from_bytes(content[place : place + 8], "big") / 1e6
             rows.setdefault(sender, []).append((came_s, message, place))
         if is_call:
-            heard[sender, number] += number == _HEARTBEAT or is_clock(message.time_unix_usec / 1e6)
+            heard[sender, number] += number == HEARTBEAT or is_clock(message.time_unix_usec / 1e6)
     if bad:
         log.note(f"{len(bad)} of {count} messages are damaged and left out, the first at byte {bad[0]}")
     if all(message.get_type() == "SYSTEM_TIME" for part in rows.values() for _, message, _ in part):
@@ -190,6 +190,19 @@ def looks_like_tlog(head: bytes) -> bool:
         if end is not None and int.from_bytes(head[place : place + 8], "big") < _LATEST_US:
             return end >= len(head) - 8 or head[end + 8] in (_V1, _V2)
     return False
+
+
+def message_end(content: bytes) -> int:
+    """Return the end of the message that begins a datagram; that of the datagram if none begins it."""
+    end = _end(bytes(8) + content, 0)
+    return len(content) if end is None else min(end - 8, len(content))
+
+
+def message_parts(message: bytes) -> tuple[int, int, bytes]:
+    """Return the number, the system and the payload of a message."""
+    if message[0] == _V2:
+        return int.from_bytes(message[7:10], "little"), message[5], message[10 : 10 + message[1]]
+    return message[5], message[3], message[6 : 6 + message[1]]
 
 
 def _frames(log: Log, content: bytes, extras: Mapping[int, bytes]) -> Iterator[tuple[int, int, int]]:

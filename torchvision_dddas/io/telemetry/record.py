@@ -32,6 +32,9 @@ _SAME_S = 1e-6
 JUMP_M, SPLIT_S, _STRAY = 200.0, 1e-3, 2
 # Two heights are the same if they differ by less than this throughout.
 _ALIKE_M = 0.5
+PAUSES = ("without samples", "the place is unknown")
+"""Words of the notes on pauses in a log."""
+
 # A pause of this many median sample intervals, and of this many seconds, is a gap with unknown values.
 _GAP_SHARE, _GAP_S = 10.0, 5.0
 # A log that has only these quantities is refused.
@@ -188,7 +191,7 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
     gaps = np.flatnonzero(steps > most)
     if len(gaps):
         log.note(
-            f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s without samples: values are unknown "
+            f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s {PAUSES[0]}: values are unknown "
             f"there. The first begins at {times[gaps[0]]:.1f} s and lasts {steps[gaps[0]]:.1f} s"
         )
     return np.sort(np.concatenate([times, (times[gaps] + times[gaps + 1]) / 2]))
@@ -368,7 +371,7 @@ def _note_silence(log: Log, samples: dict[str, np.ndarray]) -> None:
         if len(gaps):
             longest = gaps[np.argmax(steps[gaps])]
             log.note(
-                f"the place is unknown in {len(gaps)} pause{'s' * (len(gaps) > 1)}; the longest begins at "
+                f"{PAUSES[1]} in {len(gaps)} pause{'s' * (len(gaps) > 1)}; the longest begins at "
                 f"{known[longest]:.1f} s and lasts {steps[longest]:.1f} s"
             )
 

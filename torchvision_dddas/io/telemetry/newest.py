@@ -1,0 +1,186 @@
+"""Read the newest reports of a live link by the readers of logs: keep a window of them, and parse it as a file."""
+
+import csv
+import io
+import json
+import math
+import os
+import re
+import struct
+import tempfile
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry.clocks import parse_time_zone
+from torchvision_dddas.io.telemetry.mavlink import HEARTBEAT, SYSTEM_TIME, message_end, message_parts, read_tlog
+from torchvision_dddas.io.telemetry.misb import KEY, local_sets, read_misb, stamp_s
+from torchvision_dddas.io.telemetry.nmea import read_nmea
+from torchvision_dddas.io.telemetry.record import PAUSES, is_clock
+from torchvision_dddas.io.telemetry.tables import read_telemetry_table
+from torchvision_dddas.types import Telemetry
+
+_WINDOW_S, _MOST, _LEAST = 8.0, 600, 12
+# gpsd's TPV reports, whose names are ambiguous elsewhere; its estimates of errors have no stated probability.
+_GPSD = {"time": "time", "lat": "latitude_deg", "lon": "longitude_deg", "speed": "speed_m_s", "altMSL": "above_sea_m"}
+_GPSD |= {"altHAE": "above_ellipsoid_m"}
+_CSV = re.compile(rb"[^\0-\x08\x0e-\x1f]*[,;\t|][^\0-\x08\x0e-\x1f]*")
+_NO_AUTOPILOT = b"\x08"  # MAV_AUTOPILOT_INVALID, of ground stations, cameras and onboard computers
+_NAMES = {"csv": "CSV", "json": "JSON lines", "nmea": "NMEA 0183", "mavlink": "MAVLink", "klv": "KLV"}
+
+
+def kind_of_report(content: bytes) -> str:
+    """Return csv, json, nmea, mavlink or klv for a line, a datagram or a packet; "" for anything else."""
+    start = content.lstrip()
+    if start.startswith(b"{"):
+        return "json"
+    if re.match(rb"[$!][A-Z]{5,},", start):
+        return "nmea"
+    if KEY in content[:32]:  # a header of the stream may precede the packet
+        return "klv"
+    if content[:1] in (b"\xfd", b"\xfe") and len(content) > 8:
+        return "mavlink"
+    return "csv" if _CSV.fullmatch(content) else ""
+
+
+def split_reports(content: bytes) -> Iterator[bytes]:
+    """Yield the reports of a datagram: lines of text, or MAVLink messages."""
+    kind = kind_of_report(content)
+    while kind == "mavlink" and content:
+        end = message_end(content)
+        yield content[:end]
+        content = content[end:]
+    yield from [content] if kind == "klv" else (line for line in content.splitlines() if line.strip())
+
+
+class ReportWindow:
+    """The newest reports of one link, all of one kind, which the first usable report decides.
+
+    name: of the link, for messages. time_zone, order: as for `read_telemetry`. system: the vehicle whose MAVLink
+    messages are taken; 0: the first autopilot whose heartbeat comes.
+    """
+
+    def __init__(self, name: str, time_zone: str = "", order: str = "auto", system: int = 0) -> None:
+        self.name, self.kind, self.system = name, "", system
+        self._zone, self._order = parse_time_zone(time_zone), order
+        self._header = b""  # of a CSV
+        self._reports: deque[tuple[float, bytes]] = deque(maxlen=_MOST)
+        memory = "/dev/shm"  # the disk of a board does not last if it is written ten times a second
+        self._folder = tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None)
+
+    def add(self, came_s: float, content: bytes) -> str:
+        """Add a report that came at came_s, seconds since 1970. Return "", or why it is left out."""
+        kind = kind_of_report(content)
+        if not kind or (self.kind and kind != self.kind):
+            said = f"{_NAMES[kind]} comes beside {_NAMES[self.kind]}" if kind else f"{content[:30]!r} is no report"
+            return f"{said}: such reports are left out"
+        row = _row(content) if kind == "json" else content
+        if row is None:
+            return "a line is no JSON object: such lines are left out"
+        self.kind = kind
+        if kind == "mavlink" and (why := self._other_system(content)) is not None:
+            return why
+        if kind == "csv" and not self._header:
+            self._header = row
+        elif row and row != self._header:
+            self._reports.append((came_s, row))
+            while len(self._reports) > _LEAST and self._reports[0][0] < came_s - _WINDOW_S:
+                self._reports.popleft()
+        return ""
+
+    def _other_system(self, message: bytes) -> str | None:
+        """Return None for a message of the vehicle's system; else why it is left out, "" if that is no fault."""
+        number, system, payload = message_parts(message)
+        if number == HEARTBEAT and not self.system and payload[5:6] != _NO_AUTOPILOT:
+            self.system = system
+        if self.system == system and number != SYSTEM_TIME:  # times of reception count, so its clock does not matter
+            return None
+        is_usual = number in (HEARTBEAT, SYSTEM_TIME) or not self.system
+        return "" if is_usual else f"MAVLink system {system} is left out: system {self.system} is taken; see ?system=N"
+
+    @property
+    def came_s(self) -> float:
+        """When the newest report came, seconds since 1970; NaN before the first."""
+        return self._reports[-1][0] if self._reports else math.nan
+
+    def read(self) -> Telemetry | None:
+        """Return the reports, counted from 1970 by their own clock, else by their reception; None without any.
+
+        Raise InputError if they cannot be used; the older half of them is then forgotten, so that damage passes.
+        """
+        if not self._reports:
+            return None
+        path = Path(self._folder.name, f"reports.{self.kind}")
+        try:
+            path.write_bytes(self._content())
+            log = self._parse(path)
+        except InputError as error:
+            for _ in range(-(-len(self._reports) // 2)):
+                self._reports.popleft()
+            raise InputError(str(error).replace(str(path), self.name)) from None
+        notes = tuple(note for note in log.notes if not any(words in note for words in PAUSES))  # usual on a link
+        return replace(log, origin=f"{self.name} ({_NAMES[self.kind]})", notes=notes, **self._clock(log))
+
+    def close(self) -> None:
+        """Remove the window's file."""
+        self._folder.cleanup()
+
+    def _content(self) -> bytes:
+        contents = [content for _, content in self._reports]
+        if self.kind == "mavlink":
+            return b"".join(struct.pack(">Q", round(came_s * 1e6)) + content for came_s, content in self._reports)
+        if self.kind == "json":
+            rows = [json.loads(content) for content in contents]
+            text = io.StringIO()
+            table = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), restval="")
+            table.writeheader()
+            table.writerows(rows)
+            return text.getvalue().encode()
+        return b"".join(contents) if self.kind == "klv" else b"\n".join([self._header, *contents])
+
+    def _parse(self, path: Path) -> Telemetry:
+        if self.kind == "mavlink":
+            return read_tlog(path, 0.0)
+        if self.kind == "klv":
+            return read_misb(path, None, 0.0)
+        if self.kind == "nmea":
+            return read_nmea(path, path.read_text("utf-8", errors="replace"), 0.0)
+        return read_telemetry_table(path, 0.0, None, self._zone, self._order)
+
+    def _clock(self, log: Telemetry) -> dict[str, Any]:
+        start_utc_s = log.start_utc_s
+        if self.kind == "klv":  # the times of the stream, which it shares with the pictures, count
+            found = ((came_s, one) for came_s, packet in self._reports for one in local_sets(packet))
+            start_utc_s += float(np.nanmedian([came_s - stamp_s(one.tags.get(2)) for came_s, one in found]))
+        elif math.isnan(start_utc_s):  # times of an own table may count from 1970
+            start_utc_s = 0.0 if is_clock(log.time_s[-1]) else self.came_s - float(log.time_s[-1])
+        unknown = {"start_utc_s": 0.0, "start_local_s": math.nan, "latest_utc_s": math.nan}
+        return {"time_s": log.time_s + start_utc_s, **unknown}
+
+
+def _row(content: bytes) -> bytes | None:
+    """Return an object of JSON as a flat one, names of inner objects without those of the outer ones; None if damaged.
+
+    gpsd's reports get our names; those of its classes without a place become empty.
+    """
+    try:
+        given = json.loads(content)
+    except ValueError:
+        return None
+    if not isinstance(given, dict):
+        return None
+    if isinstance(given.get("class"), str):
+        if given["class"] != "TPV":
+            return b""
+        if not given.get("time") or given.get("mode", 0) < 2:  # without a fix
+            return b""
+        return json.dumps({ours: given.get(name) for name, ours in _GPSD.items()}).encode()
+    flat = dict[str, Any]()
+    for name, value in given.items():
+        flat |= {name: value} if not isinstance(value, dict) else {k: v for k, v in value.items() if k not in given}
+    return json.dumps({name: v for name, v in flat.items() if not isinstance(v, dict | list)}).encode()
