@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.geo.aerial_targets import BODY_WIDTH_M, TargetSpeeds, remove_shadow, shadow_m, sun_at
+from torchvision_dddas.geo.aerial_targets import (
+    _ACCELERATION_M_S2,
+    BODY_WIDTH_M,
+    TargetSpeeds,
+    remove_shadow,
+    shadow_m,
+    sun_at,
+)
 from torchvision_dddas.geo.landmark_watch import group_targets, merge_detections
 from torchvision_dddas.geometry import middles_of
 from torchvision_dddas.lab.simulation.cameras import camera_axes, view_from_pose
@@ -76,6 +83,24 @@ def test_a_steady_target_has_its_own_velocity_and_one_that_comes_back_after_long
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(found[-1], [1.5, -0.5], atol=0.01)
     assert np.isnan(fed([[500.0, 0.0]], [60.0], movers)).all()
+
+
+def test_the_errors_of_velocities_are_as_large_as_their_covariance_says():
+    n, lapse, sigma_m, rng = 400, 0.1, 0.3, np.random.default_rng(3)
+    identity, movers = np.arange(1, n + 1), TargetSpeeds()
+    place, velocity = rng.normal(0, 50, (n, 2)), rng.normal(0, 2, (n, 2))
+    for k in range(60):
+        found = movers.update(
+            k * lapse, identity, place + rng.normal(0, sigma_m, (n, 2)), sigma_m**2 * np.eye(2)[None].repeat(n, 0)
+        )
+        covariance = movers.covariance_of(identity)
+        assert np.array_equal(np.isnan(found).any(axis=1), np.isnan(covariance).any(axis=(1, 2)))
+        off = found - velocity
+        place = place + lapse * velocity
+        velocity = velocity + rng.normal(0, _ACCELERATION_M_S2 * np.sqrt(lapse), (n, 2))
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
+    assert squared.mean() == pytest.approx(2, abs=0.4)  # its standard deviation is 0.1
+    assert np.isnan(movers.covariance_of(np.array([-1, n + 1]))).all()
 
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))

@@ -5,6 +5,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,7 +18,7 @@ from tests.io.streamed import ABOUT, located, tracked
 from torchvision_dddas.io.maps.formats import cot
 from torchvision_dddas.io.streams import About
 from torchvision_dddas.io.streams.messages import PEOPLE_FROM, CotEvents, json_lines, mot_lines
-from torchvision_dddas.types import Adjustment, AppearanceUse, FrameResult, TrackedFrame, Tracks
+from torchvision_dddas.types import Adjustment, AppearanceUse, Camera, CameraPose, FrameResult, TrackedFrame, Tracks
 
 PAGE = (Path(__file__).parents[2] / "docs" / "stream.md").read_text(encoding="utf-8")
 
@@ -185,6 +186,78 @@ def test_memory_of_targets_does_not_grow_with_time():
     for k in range(1, 300):
         events(with_positions(located(k), target=np.array([k])))
     assert len(events._sent_s) <= 10
+
+
+CAMERA = Camera("falcon & <co>", (640, 480), (600.0, 600.0), (319.5, 239.5))
+
+
+def detail(event, name) -> Any:
+    return event.find(name)
+
+
+def own_events(events, frames):
+    sent = [ElementTree.fromstring(message) for frame in frames for message in events(frame)]
+    return [event for event in sent if str(event.get("uid")).endswith("-camera")]
+
+
+def with_fix(frame, **changes):
+    fix = replace(frame.locations.fix, **changes)
+    return replace(frame, locations=replace(frame.locations, fix=fix))
+
+
+def test_the_camera_tells_its_place_and_view_once_a_second():
+    about = replace(ABOUT, camera=CAMERA, plane_above_ellipsoid_m=700.0)
+    spread = np.diag([0.0, 0, 0, 4.0, 1.0, 8.0, 0])
+    first, second, third = own_events(CotEvents(about), [with_fix(located(k), covariance=spread) for k in range(1, 30)])
+    assert [str(event.get("time"))[17:] for event in (first, second, third)] == ["40.250Z", "41.250Z", "42.250Z"]
+    assert first.get("type") == "a-f-A-M-F-Q" and detail(first, "detail/track") is None
+    point, sensor = detail(first, "point").attrib, detail(first, "detail/sensor").attrib
+    assert (point["hae"], point["ce"], point["le"]) == ("750.00", "2.00", "3.00")
+    assert float(point["lat"]) == pytest.approx(32.23 - 5 / 110_900, abs=1e-6)
+    wide, high = (f"{2 * math.degrees(math.atan(half / 600)):.1f}" for half in (320, 240))
+    facing = ("0.0", "-90.0", "0.0", wide, high, "50")
+    assert tuple(sensor[n] for n in ("azimuth", "elevation", "roll", "fov", "vfov", "range")) == facing
+    assert sensor["model"] == detail(first, "detail/contact").get("callsign") == CAMERA.name
+
+
+def test_a_camera_that_looks_forward_tells_its_heading_and_its_course_when_it_moved_farther_than_its_errors():
+    east, down = np.array([0.0, -1.0, 0.0]), np.array([-0.5, 0.0, -math.sqrt(0.75)])
+    axes = np.column_stack([east, down, np.cross(east, down)])
+    spread = np.diag([0.0, 0, 0, 1.0, 1.0, 1.0, 0])
+
+    def flown(k, m_s):
+        pose = CameraPose(np.array([m_s * (k - 1) / 10, 0.0, 50.0]), axes)
+        return with_fix(located(k), pose=pose, covariance=spread)
+
+    for m_s, is_known in ((1.9, False), (2.1, True)):
+        event = own_events(CotEvents(replace(ABOUT, camera=CAMERA)), [flown(k, m_s) for k in (1, 11)])[1]
+        sensor, track = detail(event, "detail/sensor").attrib, detail(event, "detail/track")
+        assert (sensor["azimuth"], sensor["elevation"], sensor["range"]) == ("90.0", "-30.0", "100")
+        assert detail(event, "point").get("hae") == detail(event, "point").get("le") == "9999999.0"
+        assert (track is not None) == is_known
+        if track is not None:
+            assert (track.get("course"), track.get("speed")) == ("90.0", "2.10")
+
+
+def test_a_camera_without_a_pose_tells_no_place():
+    events = CotEvents(replace(ABOUT, camera=CAMERA))
+    assert own_events(events, [with_fix(located(1), pose=None)]) == []
+    assert own_events(CotEvents(ABOUT), [located(1)]) == []
+
+
+def test_targets_carry_the_camera_s_name_and_the_errors_of_course_and_speed():
+    frame = located(1, 3)
+    spread = np.array([np.diag([0.25, 0.25]), np.full((2, 2), np.nan)])  # the targets go 3 m/s east and 4 m/s north
+    frame = replace(frame, locations=replace(frame.locations, velocity_covariance=spread))
+    _, known, unknown = (ElementTree.fromstring(m) for m in CotEvents(replace(ABOUT, camera=CAMERA))(frame))
+    track = detail(known, "detail/track").attrib
+    course = f"{math.degrees(0.5 / 5):.1f}"
+    assert track == {"course": "36.9", "speed": "5.00", "eCourse": course, "eSpeed": "0.50"}
+    assert "eCourse" not in detail(unknown, "detail/track").attrib
+    assert detail(known, "detail/contact").get("callsign") == "falcon & <co> target 1"
+    assert known.get("uid") == "dddas-falcon & <co>-1600000000-1"
+    plain = replace(ABOUT, camera=replace(CAMERA, given=frozenset()))  # no file names this camera
+    assert ElementTree.fromstring(CotEvents(plain)(frame)[1]).get("uid") == "dddas-1600000000-1"
 
 
 @pytest.mark.parametrize("lonlat", [(np.nan, 32.0), (np.inf, 32.0), (-110.0, 91.0), (1e300, 0.0)])

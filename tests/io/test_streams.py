@@ -43,7 +43,7 @@ def frames_in(content):
 # -- Opening -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["", "json", "json:", "xml:-", "JSON:-", "-", "json:tcp://127.0.0.1:5", ":-"])
+@pytest.mark.parametrize("text", ["", "json", "json:", "xml:-", "JSON:-", "-", "json:ftp://127.0.0.1:5", ":-"])
 def test_no_stream_is_refused_with_what_is_one(text, notes):
     with pytest.raises(InputError, match=r"is no stream; wanted json, mot or cot, .* as in json:-$"):
         open_stream(text, ABOUT, notes)

@@ -126,7 +126,7 @@ def run(
         list[str] | None,
         typer.Option(
             metavar="STREAM",
-            help="With --live: json:-, json:FILE, mot:FILE, cot:udp://HOST:PORT, ...; may be repeated.",
+            help="With --live: json:-, json:FILE, mot:FILE, cot:udp://HOST:PORT, cot:tls://..., ...; may be repeated.",
         ),
     ] = None,
     serve: Annotated[

@@ -343,7 +343,8 @@ class AerialLocator:
         made = (*adjustments, *fixed.adjustments)
         at_s = fixed.time_s if math.isfinite(fixed.time_s) else when
         return AerialLocations(
-            fix.frame, at_s, positions, rows, relative, velocity, targets.box_px, fix, fixed.marks, made, spent
+            *(fix.frame, at_s, positions, rows, relative, velocity, targets.box_px, fix, fixed.marks, made, spent),
+            self._speeds.covariance_of(lasting),
         )
 
     def ground_places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:

@@ -161,6 +161,14 @@ class TargetSpeeds:
             self._tracks[name][2][:2, :2] += (1 - level) * np.outer(shift, shift)
             self._seen[name] = seen, place
 
+    def covariance_of(self, identity: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 2 2"]:
+        """Return the covariances of the velocities that the latest `update` returned, m²/s²; NaN if unknown."""
+        covariance = np.full((len(identity), 2, 2), np.nan)
+        for row, name in enumerate(identity.tolist()):
+            if name in self._tracks and np.isfinite(self._latest[1].get(name, math.nan)).all():
+                covariance[row] = self._tracks[name][2][2:, 2:]
+        return covariance
+
     def update(
         self,
         time_s: float,

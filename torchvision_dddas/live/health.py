@@ -4,6 +4,7 @@ import math
 import os
 import threading
 import time
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -19,6 +20,9 @@ from torchvision_dddas.io.output import EVENTS, RUN_JSON, AdjustmentList, Event,
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.types import Adjustment
 
+BOUNDS_S = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Upper ends of the intervals in which durations are counted, seconds."""
+
 _DURATIONS = 4096  # durations of each kind that are kept for the percentiles
 _EVENTS = 64
 _ADJUSTMENTS = 100  # listed changes of a parameter: run.json is written every few seconds
@@ -30,6 +34,7 @@ class Snapshot:
     """Health at one moment. since_s: seconds since the start. idle_s: seconds since the last result, or the start.
 
     troubles: current problems, in words. platforms: the state of further platforms.
+    histograms: of all durations since the start, the number in each interval that BOUNDS_S ends, and their sum, s.
     counts: since the start. gauges: current values. seconds: 50, 95 and 99 % quantiles of recent durations, by name.
     """
 
@@ -41,6 +46,7 @@ class Snapshot:
     events: tuple[Event, ...] = ()
     troubles: tuple[str, ...] = ()
     platforms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    histograms: Mapping[str, tuple[tuple[int, ...], float]] = field(default_factory=dict)
 
 
 class Health:
@@ -52,6 +58,8 @@ class Health:
         self._counts: Counter[str] = Counter()
         self._gauges: dict[str, float] = {}
         self._seconds: dict[str, deque[float]] = {}
+        self._histograms: dict[str, list[int]] = {}
+        self._sums_s: dict[str, float] = {}
         self._events: deque[Event] = deque(maxlen=_EVENTS)
         self._troubles: dict[str, tuple[str, float]] = {}  # text, and the time until which it holds
         self._asked: list[Callable[[], str]] = []
@@ -77,6 +85,8 @@ class Health:
         """Add a duration."""
         with self._lock:
             self._seconds.setdefault(name, deque(maxlen=_DURATIONS)).append(seconds)
+            self._histograms.setdefault(name, [0] * (len(BOUNDS_S) + 1))[bisect_left(BOUNDS_S, seconds)] += 1
+            self._sums_s[name] = self._sums_s.get(name, 0.0) + seconds
 
     def result(self) -> None:
         """Count a result; the run is not idle."""
@@ -160,10 +170,12 @@ class Health:
             counts, gauges, events = dict(self._counts), dict(self._gauges), tuple(self._events)
             troubles = [words for words, until_s in self._troubles.values() if now < until_s]
             taken = {name: list(values) for name, values in self._seconds.items()}
+            histograms = {name: (tuple(counts), self._sums_s[name]) for name, counts in self._histograms.items()}
         # Sorting thousands of durations takes a millisecond, so it is done without the lock, which a frame may need.
         seconds = {name: tuple(np.percentile(values, (50, 95, 99)).tolist()) for name, values in taken.items()}
         troubles += filter(None, [trouble() for trouble in self._asked])
-        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, tuple(troubles), self.platforms())
+        platforms = self.platforms()
+        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, tuple(troubles), platforms, histograms)
 
 
 _EVENTS_S = 0.2

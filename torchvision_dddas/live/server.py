@@ -1,7 +1,6 @@
 """Serve a live run over HTTP: the operator's page, text for Prometheus, JSON for programs."""
 
 import json
-import math
 import select
 import socket
 import threading
@@ -19,6 +18,7 @@ from torchvision_dddas.io.report import render_page
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.access import Access, cookie_name
 from torchvision_dddas.live.health import Health, Snapshot, snapshot_facts
+from torchvision_dddas.live.metrics import metrics_page
 from torchvision_dddas.live.operator_view import MOST_WATCHERS, PICTURES, OperatorView
 from torchvision_dddas.live.watchdog import Watchdog
 
@@ -124,8 +124,7 @@ def health_pages(
         return 200, "text/html", html_page(now, name, state_now(), trouble)
 
     def prometheus() -> tuple[int, str, str]:
-        text = metrics(*state(), version, {stream.name: stream.lost for stream in streams})
-        return 200, "text/plain; version=0.0.4", text
+        return metrics_page(*state(), version, {stream.name: stream.lost for stream in streams}, _HELP)
 
     def program() -> tuple[int, str, str]:
         now, trouble = state()
@@ -335,46 +334,3 @@ def _span(seconds: float) -> str:
 
 def _clock(utc_s: float) -> str:
     return datetime.fromtimestamp(utc_s, UTC).strftime("%H:%M:%S")
-
-
-def metrics(now: Snapshot, trouble: str, version: str, lost: Mapping[str, int]) -> str:
-    """Return Prometheus' text exposition format, version 0.0.4. lost: permanently lost messages, by stream."""
-    lines: list[str] = []
-
-    def add(name: str, kind: str, words: str, values: Mapping[str, float]) -> None:
-        """Add a metric. values: by labels in braces, or by "" without labels."""
-        lines.extend([f"# HELP dddas_{name} {words}", f"# TYPE dddas_{name} {kind}"])
-        lines.extend(f"dddas_{name}{labels} {_value(value)}" for labels, value in values.items())
-
-    add("info", "gauge", "What runs.", {_labels(version=version): 1})
-    add("healthy", "gauge", "1 while all is well, as /health.json says.", {"": float(not trouble)})
-    add("uptime_seconds", "gauge", "Since the start.", {"": now.since_s})
-    add("idle_seconds", "gauge", "Since the last result.", {"": now.idle_s})
-    events = {name.removeprefix("events_"): count for name, count in now.counts.items() if name.startswith("events_")}
-    if events:
-        add("events_total", "counter", "Events.", {_labels(kind=kind): count for kind, count in events.items()})
-    for name, count in now.counts.items():
-        if not name.startswith("events_"):
-            add(f"{name}_total", "counter", _HELP.get(name, name), {"": count})
-    for name, value in now.gauges.items():
-        add(name, "gauge", _HELP.get(name, name), {"": value})
-    for name, values in now.seconds.items():
-        shares = zip(("0.5", "0.95", "0.99"), values, strict=True)
-        add(f"{name}_seconds", "gauge", _HELP.get(name, name), {_labels(quantile=q): v for q, v in shares})
-    if lost:
-        words = "Messages that were lost for good."
-        add("lost_messages_total", "counter", words, {_labels(stream=s): n for s, n in lost.items()})
-    return "\n".join(lines) + "\n"
-
-
-def _labels(**labels: str) -> str:
-    def quote(text: str) -> str:
-        return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-
-    return "{" + ",".join(f'{name}="{quote(value)}"' for name, value in labels.items()) + "}"
-
-
-def _value(value: float) -> str:
-    if math.isnan(value):
-        return "NaN"
-    return ("+Inf" if value > 0 else "-Inf") if math.isinf(value) else f"{value:.12g}"

@@ -200,8 +200,9 @@ def run_live(
         begin = build_path(ready, source, people, interval, backend, health, prepare, detector, movers)
         # Data that streams need; the time follows the source's clock.
         about = About(time.time())
-        if site is not None:
-            about = About(time.time(), site.origin_deg is not None, site.landmarks.names)
+        if site is not None and ready.watch is not None:
+            height_m, locator = site.plane_above_sea_m + site.geoid_m, ready.watch.locator
+            about = About(time.time(), site.origin_deg is not None, site.landmarks.names, locator.camera, height_m)
         opened = stack.enter_context(ExitStack())
         streams = _open(opened, emit, about, health, live, "--emit")
         folder = make_session_folder(out)

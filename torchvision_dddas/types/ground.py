@@ -368,7 +368,7 @@ class AerialLocations(Record):
     positions: located targets, with absolute covariance. row: (P,) row of each position among the frame's targets.
     relative_m2: (P, 2, 2) covariance relative to the landmarks, without the error common to their receivers.
     velocity_m_s: (P, 2) east, north, NaN if unknown. box_px: (N, 4) of all targets. marks: the landmarks as used.
-    adjustments, seconds: as in Scene.
+    adjustments, seconds: as in Scene. velocity_covariance: (P, 2, 2) of velocity_m_s in m²/s², or empty if unknown.
 
     >>> camera = td.Camera("uav", (640, 480), (600.0, 600.0), (319.5, 239.5))
     >>> none = np.zeros(2)
@@ -390,6 +390,7 @@ class AerialLocations(Record):
     marks: LandmarkObservations
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    velocity_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
 
 @dataclass(frozen=True)

@@ -241,6 +241,7 @@ STALE_S, MARK_STALE_S = 10.0, 600.0
 """Seconds for which the events of a target and of a mark are valid."""
 _KIND = "a-u-G"  # an atom on the ground of unknown affiliation
 _MARK = "b-m-p-s-m"  # a spot on the map
+_OWN = "a-f-A-M-F-Q"  # a friendly unmanned aircraft
 
 
 def cot(tracks: GroundTracks, source: str = "dddas") -> str:
@@ -267,8 +268,8 @@ def cot(tracks: GroundTracks, source: str = "dddas") -> str:
     return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + "".join(lines) + "</events>\n"
 
 
-def event_uid(source: str, start_utc_s: float, target: int) -> str:
-    """Return the uid of a target in a run."""
+def event_uid(source: str, start_utc_s: float, target: int | str) -> str:
+    """Return the uid of a target in a run, or of its camera."""
     return f"{xml_text(source)}-{start_utc_s:.0f}-{target}"
 
 
@@ -279,21 +280,66 @@ def event(
     place: tuple[float, float, float],
     sigma_m: np.ndarray,
     velocity_m_s: np.ndarray,
+    velocity_covariance: np.ndarray | None = None,
+    source: str = "",
 ) -> str:
     """Return the line of a target's event. when: its time, and the time until which it is valid.
 
     place: longitude, latitude, and metres above the ellipsoid, NaN if unknown. sigma_m: (2,) standard deviations along
     the axes of the ellipse, the longer first. The first becomes ce. The remark names the category of the 90 % error.
+    velocity_covariance: (2, 2) in m²/s². source: the name of the camera, which begins the callsign.
     """
     within_m = circular_error_90(sigma_m)
     category = error_category(within_m)[0]
     remark = f"<remarks>{category}, 90 % within {within_m[0]:.1f} m</remarks>" if category else ""
+    track = _track(velocity_m_s, velocity_covariance)
+    name = f"{source} target {target}".lstrip()
+    return _event(uid, _KIND, name, when, place, float(sigma_m[0]), track + remark)
+
+
+def own_event(
+    uid: str,
+    name: str,
+    when: tuple[str, str],
+    place: tuple[float, float, float],
+    sigma_m: tuple[float, float],
+    angles_rad: tuple[float, float, float],
+    view_rad: tuple[float, float],
+    range_m: float,
+    velocity_m_s: np.ndarray,
+) -> str:
+    """Return the event of the camera in the air: its place, and a `sensor` detail with its view.
+
+    when, place: as for `event`. sigma_m: horizontal and vertical. angles_rad: heading, pitch below the horizon and
+    roll. view_rad: horizontal and vertical field of view. range_m: to the ground along the optical axis, NaN if it does
+    not meet the ground. Source: MITRE, CoT_sensor.xsd.
+    """
+    heading, pitch, roll = (round(math.degrees(angle), 1) for angle in angles_rad)
+    fov, vfov = (math.degrees(angle) for angle in view_rad)
+    seen = f' range="{range_m:.0f}"' if math.isfinite(range_m) else ""
+    sensor = (
+        f'<sensor azimuth="{heading % 360:.1f}" elevation="{-pitch:.1f}" roll="{roll:.1f}" fov="{fov:.1f}" '
+        f'vfov="{vfov:.1f}"{seen} type="r-e" model="{xml_text(name)}"/>'
+    )
+    return _event(uid, _OWN, name, when, place, sigma_m[0], _track(velocity_m_s) + sensor, sigma_m[1])
+
+
+def _track(velocity_m_s: np.ndarray, covariance: np.ndarray | None = None) -> str:
+    """Return the element of course and speed with their standard deviations; empty if the velocity is unknown.
+
+    Source: MITRE, CoT_track.xsd.
+    """
     east, north = velocity_m_s.tolist()
-    track = ""
-    if math.isfinite(east) and math.isfinite(north):
-        course = round(math.degrees(math.atan2(east, north)), 1) % 360
-        track = f'<track course="{course:.1f}" speed="{math.hypot(east, north):.2f}"/>'
-    return _event(uid, _KIND, f"target {target}", when, place, float(sigma_m[0]), track + remark)
+    if not (math.isfinite(east) and math.isfinite(north)):
+        return ""
+    speed, errors = math.hypot(east, north), ""
+    if covariance is not None and np.isfinite(covariance).all() and speed > 0:
+        along, across = velocity_m_s / speed, np.array([north, -east]) / speed
+        speed_sigma, across_sigma = (math.sqrt(max(float(d @ covariance @ d), 0.0)) for d in (along, across))
+        course_sigma = min(math.degrees(across_sigma / speed), 180.0)
+        errors = f' eCourse="{course_sigma:.1f}" eSpeed="{speed_sigma:.2f}"'
+    course = round(math.degrees(math.atan2(east, north)), 1) % 360
+    return f'<track course="{course:.1f}" speed="{speed:.2f}"{errors}/>'
 
 
 def mark(uid: str, name: str, when: tuple[str, str], place: tuple[float, float]) -> str:
@@ -309,12 +355,14 @@ def _event(
     place: tuple[float, float, float],
     sigma_m: float,
     detail: str = "",
+    height_sigma_m: float = math.nan,
 ) -> str:
     longitude, latitude, above_ellipsoid_m = place
     time, stale = when
-    error, hae = (f"{value:.2f}" if math.isfinite(value) else UNKNOWN for value in (sigma_m, above_ellipsoid_m))
+    known = (f"{v:.2f}" if math.isfinite(v) else UNKNOWN for v in (sigma_m, above_ellipsoid_m, height_sigma_m))
+    error, hae, height_error = known
     return (
         f'<event version="2.0" uid="{uid}" type="{kind}" how="m-f" time="{time}" start="{time}" stale="{stale}">'
-        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{hae}" ce="{error}" le="{UNKNOWN}"/>'
+        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{hae}" ce="{error}" le="{height_error}"/>'
         f'<detail><contact callsign="{xml_text(name)}"/>{detail}</detail></event>\n'
     )

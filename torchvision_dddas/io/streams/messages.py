@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.io.maps.formats import MARK_STALE_S, STALE_S, event, event_uid, mark
+from torchvision_dddas.geometry import GEOID_SIGMA_M, lonlat
+from torchvision_dddas.io.maps.formats import MARK_STALE_S, STALE_S, event, event_uid, mark, own_event
 from torchvision_dddas.io.maps.ground_tracks import iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
 from torchvision_dddas.io.output.zone_events import event_fields
 from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
-from torchvision_dddas.types import AppearanceUse, FrameResult, FusedTargets, TrackedFrame
+from torchvision_dddas.types import AerialLocations, AppearanceUse, Camera, FrameResult, FusedTargets, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
 """Added to the identities of people, which are separate from those of targets: MOT text has no column for a kind."""
@@ -23,6 +23,7 @@ EVERY_S = 1.0
 """Seconds between two messages on a target."""
 
 _FARTHEST_PX = 1e7
+_STEEP_RAD = math.radians(80.0)  # a camera that looks lower below the horizon looks straight down
 _LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four digits for a year
 
 
@@ -32,12 +33,19 @@ class About:
 
     start_utc_s: seconds since 1970 at time_s = 0, NaN without a known clock. A live run sets it at its first
     picture, and again when the machine's clock is set. geographic: whether targets get longitudes and latitudes.
-    landmarks: their names.
+    landmarks: their names. camera: the camera in the air. plane_above_ellipsoid_m: height of the local plane, up = 0.
     """
 
     start_utc_s: float = float("nan")
     geographic: bool = False
     landmarks: tuple[str, ...] = ()
+    camera: Camera | None = None
+    plane_above_ellipsoid_m: float = float("nan")
+
+    @property
+    def source(self) -> str:
+        """The camera's name; empty if no camera file gives one."""
+        return "" if self.camera is None or self.camera.given == frozenset() else self.camera.name
 
     def utc(self, time_s: float) -> str | None:
         """Return ISO 8601 to the millisecond; None if the time is unknown."""
@@ -255,13 +263,14 @@ def mot_lines(
 
 
 class CotEvents:
-    """Cursor-on-Target events of frames, given in order: at most one per target and second."""
+    """Cursor-on-Target events of frames, given in order: at most one per second of each target and of the camera."""
 
     def __init__(self, about: About) -> None:
         self._about = about
         self._sent_s: dict[int, float] = {}
         self._marks = 0
         self._begun_utc_s: float | None = None  # stays when the clock is set, so that targets keep their uid
+        self._own: tuple[float, np.ndarray] = -math.inf, np.full(2, np.nan)  # time and place of its last event
 
     def __call__(
         self, result: FrameResult | None, people: TrackedFrame | None = None, age_s: float = 0.0, most_bytes: int = 0
@@ -278,21 +287,58 @@ class CotEvents:
         self._sent_s = {target: sent for target, sent in self._sent_s.items() if 0 <= now_s - sent < EVERY_S - 1e-6}
         axes, _ = semi_axes(at.covariance_m2, chi2=1.0)
         time, stale = iso_utc(self._about.start_utc_s + np.array([now_s, now_s + STALE_S]))
-        messages = []
+        now, source = (time, stale), self._about.source
+        messages = self._own_events(located, now)
         for row, target in enumerate(at.target.tolist()):
             longitude, latitude = degrees[row].tolist()
             if target in self._sent_s or not (abs(longitude) <= 180 and abs(latitude) <= 90):
                 continue
             self._sent_s[target] = now_s
-            uid = event_uid("dddas", self._begun_utc_s, target)
             sigma_m, velocity = axes[row], located.velocity_m_s[row]
+            spread = located.velocity_covariance[row] if len(located.velocity_covariance) else None
             place = longitude, latitude, float(at.above_ellipsoid_m[row])
-            messages.append(event(uid, target, (time, stale), place, sigma_m, velocity).encode())
+            messages.append(event(self._uid(target), target, now, place, sigma_m, velocity, spread, source).encode())
         for one in result.events if result is not None else ():
             if np.isfinite(one.lonlat_deg).all():
                 self._marks += 1
-                uid = f"{event_uid('dddas', self._begun_utc_s, one.target)}-{self._marks}"
+                uid = f"{self._uid(one.target)}-{self._marks}"
                 when = iso_utc(self._about.start_utc_s + np.array([one.time_s, one.time_s + MARK_STALE_S]))
                 where = one.lonlat_deg[0], one.lonlat_deg[1]
                 messages.append(mark(uid, one.describe(), (when[0], when[1]), where).encode())
         return messages
+
+    def _uid(self, target: int | str) -> str:
+        source = f"dddas-{self._about.source}".rstrip("-")
+        return event_uid(source, self._begun_utc_s or 0.0, target)
+
+    def _own_events(self, located: AerialLocations, when: tuple[str, str]) -> list[bytes]:
+        """Return the event of the camera, at most one per second; none if its pose is unknown."""
+        fix, camera, origin, now_s = located.fix, self._about.camera, located.positions.origin_deg, located.time_s
+        before_s, before_m = self._own
+        lapse_s = now_s - before_s
+        if fix.pose is None or camera is None or origin is None or 0 <= lapse_s < EVERY_S - 1e-6:
+            return []
+        place_m, (heading, pitch, roll) = fix.pose.place_m, fix.pose.angles_rad
+        (longitude, latitude), up_m = lonlat(place_m[None, :2], origin)[0].tolist(), float(place_m[2])
+        if not (abs(longitude) <= 180 and abs(latitude) <= 90):
+            return []
+        self._own = now_s, place_m[:2]
+        sigma_m, height_sigma_m = math.nan, math.nan
+        if fix.covariance is not None:
+            sigma_m = float(semi_axes(fix.covariance[None, 3:5, 3:5], chi2=1.0)[0][0, 0])
+            height_sigma_m = math.hypot(math.sqrt(max(float(fix.covariance[5, 5]), 0.0)), GEOID_SIGMA_M)
+        moved_m = place_m[:2] - before_m
+        # The errors of two places differ, so a short way gives no course.
+        is_course_known = 0 < lapse_s < STALE_S and math.hypot(*moved_m) > 2 * sigma_m
+        velocity = moved_m / lapse_s if is_course_known else np.full(2, np.nan)
+        half_px, focal_px = np.array(camera.size_px) / 2, np.array(camera.focal_px) * fix.pose.focal
+        view_rad = 2 * np.arctan(half_px / focal_px)
+        range_m = up_m / math.sin(pitch) if up_m > 0 and math.sin(pitch) > 0.01 else math.nan
+        where = longitude, latitude, self._about.plane_above_ellipsoid_m + up_m
+        if pitch > _STEEP_RAD:  # the heading of the optical axis is noise, so take that of the picture's upper edge
+            upper = -fix.pose.axes[:, 1]
+            heading, roll = math.atan2(upper[0], upper[1]), 0.0
+        name = self._about.source or "dddas"
+        sigmas = sigma_m, height_sigma_m if math.isfinite(where[2]) else math.nan
+        angles, view = (heading, pitch, roll), (float(view_rad[0]), float(view_rad[1]))
+        return [own_event(self._uid("camera"), name, when, where, sigmas, angles, view, range_m, velocity).encode()]

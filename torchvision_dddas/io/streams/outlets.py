@@ -26,6 +26,9 @@ MOST_BYTES = 65_507
 LEAST_BYTES = 512
 """The smallest limit of a datagram, which holds one target."""
 
+LAST_S = 1.0
+"""Longest wait for a reader when closing, seconds."""
+
 WANTED = "wanted udp://HOST:PORT, or udp://[IPV6]:PORT, with ?ttl=1 to 255, bytes=512 to 65507 or interface=NAME, by &"
 
 # By address family: level of the options, hops of unicast and of multicast datagrams, interface of multicast.
@@ -37,7 +40,6 @@ _OPTIONS = {
     ),
 }
 _AT_ONCE = 4096  # Linux: a ready pipe accepts this many bytes in one piece without blocking
-_LAST_S = 1.0  # longest wait for a reader when closing
 
 
 class Outlet(ABC):
@@ -58,11 +60,11 @@ class Outlet(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Send as much as is accepted now, each message whole or not at all. Raise OSError on trouble."""
+        """Send as much as is accepted now, each message whole or not at all. Raise OSError as `mend` does."""
 
     @abstractmethod
     def mend(self) -> None:
-        """Reopen after trouble. Raise OSError if that fails."""
+        """Reopen after trouble. Raise OSError if that fails, BlockingIOError while it is not decided."""
 
     def handle(self) -> int | None:
         """Return a new descriptor of the file to sync, which the caller closes; None without a file."""
@@ -78,31 +80,48 @@ class Outlet(ABC):
             self.reason = reason
 
 
-class LineOutlet(Outlet):
+class KeptOutlet(Outlet):
+    """Keep up to KEPT_BYTES of messages for a slow reader."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept_bytes = 0
+        self._begun = 0  # bytes of the first kept message that are already written
+        self._is_held = False  # whether the first kept message must stay although no byte of it is written
+
+    def put(self, messages: Sequence[bytes]) -> None:
+        """Keep messages, up to KEPT_BYTES."""
+        self._kept += messages
+        self._kept_bytes += sum(map(len, messages))
+        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
+            # A partly written message stays, so that the next one does not begin in its middle.
+            oldest = 1 if self._begun or self._is_held else 0
+            self._kept_bytes -= len(self._kept[oldest])
+            del self._kept[oldest]
+            self._lose(1, "it is read too slowly")
+
+    def _sent(self) -> None:
+        """Remove the first message, which is written whole."""
+        self._kept_bytes -= len(self._kept.popleft())
+        self._begun, self._is_held = 0, False
+
+    def _lose_all(self) -> None:
+        self._lose(len(self._kept), "it was not taken in time")
+        self._kept.clear()
+
+
+class LineOutlet(KeptOutlet):
     """Write lines into a file, a pipe, or standard output, which is never closed."""
 
     def __init__(self, path: Path | None) -> None:
         """Open for appending. path: None for standard output. Raise OSError if it cannot be opened."""
         super().__init__()
         self._path = path
-        self._kept_bytes = 0
-        self._begun = 0  # bytes of the first kept line that are already written
         self._file = 1
         if path is not None:
             self._file = -1
             self.mend()
         self._regular = stat.S_ISREG(os.fstat(self._file).st_mode)
-
-    def put(self, messages: Sequence[bytes]) -> None:
-        """Keep lines, up to KEPT_BYTES."""
-        self._kept += messages
-        self._kept_bytes += sum(map(len, messages))
-        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
-            # A partly written line stays, so that the next one does not begin in its middle.
-            oldest = 1 if self._begun else 0
-            self._kept_bytes -= len(self._kept[oldest])
-            del self._kept[oldest]
-            self._lose(1, "it is read too slowly")
 
     def flush(self) -> None:
         """Write lines while the reader accepts them; reopen the file if it was renamed, as log rotation does."""
@@ -120,9 +139,7 @@ class LineOutlet(Outlet):
                 self._take_back()
                 raise _explained(error) from error
             if self._begun >= len(line):
-                self._kept.popleft()
-                self._kept_bytes -= len(line)
-                self._begun = 0
+                self._sent()
 
     def mend(self) -> None:
         """Reopen a file, and end an unfinished line of an earlier writer."""
@@ -147,7 +164,7 @@ class LineOutlet(Outlet):
 
     def close(self) -> None:
         """Wait a little for a reader that is at work."""
-        until = time.monotonic() + _LAST_S
+        until = time.monotonic() + LAST_S
         with suppress(OSError):
             if self._file < 0:
                 self.mend()
@@ -157,8 +174,7 @@ class LineOutlet(Outlet):
                 self.flush()
             if self._regular:
                 os.fsync(self._file)
-        self._lose(len(self._kept), "it was not taken in time")
-        self._kept.clear()
+        self._lose_all()
         self._shut()
 
     def _is_ready(self, wait_s: float = 0.0) -> bool:

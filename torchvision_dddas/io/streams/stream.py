@@ -12,7 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError, without_secrets
+from torchvision_dddas.io.streams.connections import open_connection
 from torchvision_dddas.io.streams.messages import About, CotEvents, json_lines, mot_lines
+from torchvision_dddas.io.streams.mqtt import open_mqtt
 from torchvision_dddas.io.streams.outlets import LineOutlet, Outlet, open_datagrams
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
@@ -22,7 +24,10 @@ Notify = Callable[[str, str], object]
 Encoder = Callable[[FrameResult | None, TrackedFrame | None, float, int], Sequence[bytes]]
 """Returns the messages of a frame's targets and people. Third: its age, s. Fourth: longest message, 0: no limit."""
 
-WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
+WANTED = (
+    "wanted json, mot or cot, a colon, and - for standard output, a FILE, HOST:PORT after udp://, tcp:// or tls://, or "
+    "HOST:PORT/TOPIC after mqtt://, as in json:-"
+)
 
 _BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
 _MOST_WAIT_S = 2.0  # longest wait for datagrams, which cost nothing to try
@@ -125,6 +130,8 @@ class Stream:
             if self._trouble:
                 self._outlet.mend()
             self._outlet.flush()
+        except BlockingIOError:  # a connection is being opened; the next frame goes on with it
+            return
         except OSError as error:
             self._retry_later(error)
             return
@@ -195,8 +202,10 @@ def open_stream(
     events without places.
     """
     kind, colon, place = text.partition(":")
-    asked = f"{option} {text}"
-    is_address = _is_address(place)
+    is_address, scheme = _is_address(place), place.partition(":")[0].lower()
+    is_datagram = scheme == "udp"
+    # The query of a connection names the files of its keys.
+    asked = f"{option} {without_secrets(text).partition('?')[0] if is_address and not is_datagram else text}"
     if kind not in _BEGINS or not colon or not place or ("://" in place and not is_address):
         raise InputError(f"{option} {text!r} is no stream; {WANTED}")
     encode: Encoder
@@ -212,16 +221,22 @@ def open_stream(
             "emit json instead"
         )
     try:
-        outlet: Outlet = open_datagrams(place, asked) if is_address else _open_lines(place, kind, asked)
+        outlet: Outlet
+        if is_datagram:
+            outlet = open_datagrams(place, asked)
+        elif scheme.startswith("mqtt") and is_address:
+            outlet = open_mqtt(place, asked)
+        else:
+            outlet = open_connection(place, asked) if is_address else _open_lines(place, kind, asked)
     except OSError as error:
         raise InputError(f"{asked}: {error.strerror or error}; choose another place") from None
     return Stream(
-        text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if is_address else retry_most_s
+        text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if is_datagram else retry_most_s
     )
 
 
 def _is_address(place: str) -> bool:
-    return place.lower().startswith("udp:")
+    return place.lower().startswith(("udp:", "tcp:", "tls:", "mqtt:", "mqtts:"))
 
 
 def _path(place: str, asked: str) -> Path:
