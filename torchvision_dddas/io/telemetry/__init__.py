@@ -14,6 +14,7 @@ from torchvision_dddas.io.telemetry.autopilots import NAMES as MAVLINK_NAMES
 from torchvision_dddas.io.telemetry.clocks import parse_time_zone
 from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, message_parts, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
+from torchvision_dddas.io.telemetry.misb_packets import encode_flight
 from torchvision_dddas.io.telemetry.newest import ReportWindow, kind_of_report, split_reports
 from torchvision_dddas.io.telemetry.nmea import SENTENCE, read_nmea
 from torchvision_dddas.io.telemetry.record import KINDS, is_clock
@@ -24,6 +25,7 @@ from torchvision_dddas.types import Telemetry
 __all__ = [
     "MAVLINK_NAMES",
     "ReportWindow",
+    "encode_flight",
     "is_clock",
     "kind_of_report",
     "message_parts",
