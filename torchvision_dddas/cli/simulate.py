@@ -33,26 +33,68 @@ def simulate(
     ] = None,
     frames: Annotated[int | None, typer.Option(metavar="N", help="Frames to make. [default: the whole run]")] = None,
     save: Annotated[
-        str,
-        typer.Option(metavar="NAMES", help="frames,video,masks,ground, all or none; tables are always written."),
-    ] = "frames,masks,ground",
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="frames,video,masks,ground, all or none; tables are always written. [default: frames,masks,ground; "
+            "none with --serve]",
+        ),
+    ] = None,
+    serve: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Serve the UAV's camera as MPEG-TS with KLV: udp://HOST:PORT sends there, tcp://HOST:PORT listens.",
+        ),
+    ] = None,
+    serve_mavlink: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="Serve the UAV as a MAVLink system that obeys: udpout:127.0.0.1:14550."),
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option(metavar="X", help="Speed of a served world; 2 is twice real time. [default: 1]")
+    ] = None,
+    link: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CONDITIONS", help="Of the served links: latency=0.5,jitter=0.1,loss=0.05,dropout=2/20,clock=1."
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FAULT", help="Of a served instrument, as gps=stuck@10..20; may be repeated."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a team of vehicles in and above a desert, and write the data of its instruments and the truth.
+
+    With --serve or --serve-mavlink, other programs see and steer the world while it runs.
 
     Writes frames/, telemetry.csv, landmarks.csv, colours.toml, camera.toml and dem.tif for `dddas run`,
     ground/ for `dddas people` and `dddas locate ground`, truth/ for `dddas evaluate`, scenario.toml and run.json.
     """
     from torchvision_dddas.io.output import parse_save
-    from torchvision_dddas.lab.simulation import RECORDED, load_scenario, record_scenario, scenario_names
+    from torchvision_dddas.lab.simulation import (
+        RECORDED,
+        ServeOptions,
+        load_scenario,
+        record_scenario,
+        scenario_names,
+    )
 
     if scenario is None:
         print_lines([f"{name:12s} {load_scenario(name).about}" for name in scenario_names()])
         return
     if frames is not None and frames < 1:
         raise InputError(f"--frames must be 1 or more, got {frames}")
+    served = None
+    if serve is not None or serve_mavlink is not None:
+        served = ServeOptions(serve, serve_mavlink, 1.0 if speed is None else speed, link, tuple(fault or ()))
+    elif speed is not None or link is not None or fault:
+        raise InputError("--speed, --link and --fault are for a served world: give --serve or --serve-mavlink")
+    save = save or ("frames,masks,ground" if served is None else "none")
     chosen, kinds = load_scenario(scenario, set_ or [], seed), parse_save(save, RECORDED)
-    record = record_scenario(out, chosen, kinds, frames, scenario, partial(progress, quiet=quiet))
+    record = record_scenario(out, chosen, kinds, frames, scenario, partial(progress, quiet=quiet), served)
     print_lines(_summary(record, out, chosen), quiet)
 
 

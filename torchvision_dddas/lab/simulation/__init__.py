@@ -11,6 +11,7 @@ from torchvision_dddas.lab.simulation.scenario import (
     scenario_settings,
     scenario_toml,
 )
+from torchvision_dddas.lab.simulation.serving import ServeOptions
 from torchvision_dddas.lab.simulation.simulator import (
     SimulatorSource,
     name_scenario_in_errors,
@@ -24,6 +25,7 @@ __all__ = [
     "CarPlan",
     "CrowdPlan",
     "Scenario",
+    "ServeOptions",
     "SimulatedRunRecorder",
     "SimulatorSource",
     "film",

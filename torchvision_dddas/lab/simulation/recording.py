@@ -3,8 +3,8 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,6 +21,7 @@ from torchvision_dddas.io.output import RUN_JSON, Part, PartOf, RunRecord, RunRe
 from torchvision_dddas.io.overlay_video import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.lab.simulation.scenario import Scenario, load_scenario, scenario_settings, scenario_toml
+from torchvision_dddas.lab.simulation.serving import ServeOptions, SimulatorServer
 from torchvision_dddas.lab.simulation.simulator import Shot, Simulator, name_scenario_in_errors, open_simulator
 from torchvision_dddas.lab.simulation.truth import TruthOutput, moving_mask
 from torchvision_dddas.types import Camera, Flight, GroundPicture
@@ -41,12 +42,14 @@ class _Recorded:
     """A frame of a recording. shown: its picture, or the last picture if the camera dropped the frame.
 
     ground: the pictures of the ground vehicles. seconds: computing time of the frame, per stage.
+    utc_s: when the frame was served, seconds since 1970; NaN if it was not.
     """
 
     shot: Shot
     shown: np.ndarray
     ground: tuple[GroundPicture, ...]
     seconds: dict[str, float]
+    utc_s: float = math.nan
 
 
 def record_scenario(
@@ -56,31 +59,38 @@ def record_scenario(
     frames: int | None = None,
     name: str = "simulated",
     progress: Callable[[str, int], AbstractContextManager[Callable[[], None]]] | None = None,
+    serve: ServeOptions | None = None,
 ) -> RunRecord:
-    """Run a scenario without steering, write the data of all its instruments, and return the record of the run.
+    """Run a scenario, write the data of all its instruments, and return the record of the run.
 
     save: some of RECORDED. frames: limit of frames. name: the scenario's name in messages. progress: returns a context
-    for a name and a number of frames, with a function to call for each frame. Raises InputError for bad input.
+    for a name and a number of frames, with a function to call for each frame. serve: the devices as which the world is
+    served while it runs; without them nobody steers it. Raises InputError for bad input.
     """
-    with _RecordingOutput(folder, save) as output:
+    with _RecordingOutput(folder, save) as output, ExitStack() as stack:
         with name_scenario_in_errors(name):
             simulator = open_simulator(scenario)
+        server = None if serve is None else stack.enter_context(SimulatorServer(serve, scenario))
         count = min(simulator.frames, frames or simulator.frames)
-        record = output.begin(simulator, count)
+        record = output.begin(simulator, count, serve)
         shown = nullcontext(lambda: None) if progress is None else progress(Path(name).stem, count)
         with shown as tick:
             for number, frame in enumerate(_run(simulator, count, "ground" in save), 1):
-                output.write(frame)
+                utc_s = math.nan if server is None else server.show(simulator, frame.shot)
+                output.write(replace(frame, utc_s=utc_s))
                 tick()
                 if number == 1:
                     record.notes += _write_elevation(folder / "dem.tif", simulator)
+        if server is not None:
+            stack.close()
+            record.notes += server.notes
         if "video" in save and record.counts["dropped"]:
             record.notes.append("where the camera dropped a frame, clip.mp4 repeats the last picture")
     return record
 
 
 def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Recorded]:
-    """Yield the frames of a run without steering. has_ground: whether ground vehicles take pictures."""
+    """Yield the frames of a run. has_ground: whether ground vehicles take pictures."""
     apart = _pictures_apart(simulator.scenario)
     shown = np.zeros((*simulator.camera.size_px[::-1], 3), np.uint8)
     for k in range(count):
@@ -145,13 +155,14 @@ class _RecordingOutput(RunRecorder[_Recorded]):
 
     files: ClassVar[tuple[str, ...]] = (
         *("clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif", "scenario.toml"),
-        *("ground/*/camera.toml", "ground/*/platform.toml", "ground/*/poses.csv", *TruthOutput.files, RUN_JSON),
+        *("ground/*/camera.toml", "ground/*/platform.toml", "ground/*/poses.csv", *TruthOutput.files, "served.csv"),
+        RUN_JSON,
     )
     numbered: ClassVar[tuple[str, ...]] = ("frames", "ground/*", "truth/masks")
     saved: ClassVar[tuple[str, ...]] = RECORDED
 
-    def begin(self, simulator: Simulator, count: int) -> RunRecord:
-        """Start the record of a run of `count` frames."""
+    def begin(self, simulator: Simulator, count: int, serve: ServeOptions | None = None) -> RunRecord:
+        """Start the record of a run of `count` frames. serve: as in `record_scenario`."""
         scenario, camera, colours = simulator.scenario, simulator.camera, simulator.colours
         rate_hz, folder = scenario.clip.rate_hz, self.folder
         facts = {
@@ -171,6 +182,9 @@ class _RecordingOutput(RunRecorder[_Recorded]):
             "video": OverlayVideo(folder, rate_hz, lambda item: item.shown, "clip.mp4"),
             "ground": _Ground(folder / "ground", simulator.names, rate_hz / _pictures_apart(scenario)),
         }
+        if serve is not None:
+            facts["served"] = asdict(serve)
+            parts["served"] = _Served(folder)
         record = self.start(facts, parts)
         record.counts = {"events": [], "dropped": 0}
         return record
@@ -215,6 +229,21 @@ class _Tables:
 
     def close(self, complete: bool) -> None:
         self._files.write("", "".join(self._plans.values()))
+        self._files.close()
+
+
+class _Served:
+    """Writes served.csv: when each frame of a served world was sent, by this machine's clock."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files = TextFiles({folder / "served.csv": "frame,time_s,utc_s\n"})
+        self.discard = self._files.discard
+
+    def write(self, item: _Recorded) -> None:
+        truth = item.shot.truth
+        self._files.write(f"{truth.frame},{_short(truth.time_s, 6)},{item.utc_s:.6f}\n")
+
+    def close(self, complete: bool) -> None:
         self._files.close()
 
 

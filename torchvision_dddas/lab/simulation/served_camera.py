@@ -1,0 +1,121 @@
+"""A camera as a device: H.264 pictures with MISB ST 0601 metadata in an MPEG transport stream, over UDP or TCP."""
+
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from fractions import Fraction
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+
+_DATAGRAM = 7 * 188  # bytes: the usual seven packets
+_BURST = 24  # datagrams at once, because the buffers of receivers are small
+_HZ = 90_000
+_SEND_S = 0.5  # a TCP client that takes nothing for this time is disconnected
+
+
+class StreamSender:
+    """Sends a transport stream: as datagrams to an address, or to the clients that connect to it."""
+
+    def __init__(self, url: str) -> None:
+        """Open `udp://HOST:PORT` (send there) or `tcp://HOST:PORT` (listen there). Raise InputError."""
+        self._clients: list[socket.socket] = []
+        try:
+            parts = urlsplit(url)
+            host, port, self.is_udp = parts.hostname, parts.port, parts.scheme == "udp"
+        except ValueError:
+            host = port = None
+        if not host or not port or parts.scheme not in ("udp", "tcp"):
+            raise InputError(f"--serve {url}: wanted udp://HOST:PORT or tcp://HOST:PORT, such as udp://127.0.0.1:5600")
+        try:
+            if self.is_udp:
+                family, kind, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+                self._socket = socket.socket(family, kind)
+                self._socket.connect(place)
+            else:
+                self._socket = socket.create_server((host, port))
+                self._socket.setblocking(False)
+        except OSError as error:
+            raise InputError(f"--serve {url} cannot be opened: {error.strerror or error}; check the address") from None
+
+    def send(self, content: bytes) -> None:
+        """Send a datagram, or the same bytes to all clients. Never raise OSError."""
+        if self.is_udp:
+            with suppress(OSError):  # nobody listens at present
+                self._socket.send(content)
+            return
+        with suppress(BlockingIOError):
+            self._clients.append(self._socket.accept()[0])
+            self._clients[-1].settimeout(_SEND_S)
+        for client in tuple(self._clients):
+            try:
+                client.sendall(content)
+            except OSError:
+                self._clients.remove(client)
+                client.close()
+
+    def close(self) -> None:
+        """Disconnect the clients."""
+        for each in (*self._clients, self._socket):
+            each.close()
+
+
+class CameraStream:
+    """Encodes pictures and metadata as a transport stream. Time stamps are those of the moments of sending."""
+
+    def __init__(self, size_px: tuple[int, int], rate_hz: float, send: Callable[[bytes], object]) -> None:
+        """send: called with datagrams of whole packets. Raise InputError without PyAV, and for odd sizes."""
+        try:
+            import av
+        except ImportError:
+            raise InputError("--serve needs PyAV: pip install 'torchvision-dddas[video]'") from None
+        if size_px[0] % 2 or size_px[1] % 2:
+            raise InputError(f"--serve needs pictures of even width and height, got {size_px[0]}x{size_px[1]}")
+        self._av, self._send, self._written = av, send, bytearray()
+        prompt = {"flush_packets": "1", "max_interleave_delta": "1"}
+        opened: Any = av.open(self, "w", format="mpegts", buffer_size=100 * _DATAGRAM, container_options=prompt)
+        # A key frame a second, with its headers, lets receivers begin at any time.
+        options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18", "x264-params": "repeat-headers=1"}
+        options["g"] = str(max(1, round(rate_hz)))
+        self._video = opened.add_stream("libx264", rate=Fraction(rate_hz).limit_denominator(1000), options=options)
+        self._video.width, self._video.height = size_px
+        self._video.pix_fmt, self._video.codec_context.time_base = "yuv420p", Fraction(1, _HZ)
+        self._video.codec_context.thread_count = 1
+        self._data, self._container = opened.add_data_stream("klv"), opened
+        self._begin_s, self._last = time.monotonic(), -1
+
+    def write(self, content: bytes) -> int:
+        """Take bytes from the muxer."""
+        self._written += content
+        return len(content)
+
+    def show(self, image: np.ndarray | None, metadata: bytes | None) -> None:
+        """Send a picture (H, W, 3) BGR and its metadata, either of which may be missing."""
+        self._last = max(round(_HZ * (time.monotonic() - self._begin_s)), self._last + 1)
+        packets = []
+        if metadata is not None:
+            packets.append(self._av.Packet(metadata))
+            packets[0].stream, packets[0].time_base = self._data, Fraction(1, _HZ)
+            packets[0].pts = packets[0].dts = self._last
+        if image is not None:
+            frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+            frame.pts, frame.time_base = self._last, Fraction(1, _HZ)
+            packets += self._video.encode(frame)
+        self._container.mux(packets)
+        self._hand_on()
+
+    def close(self) -> None:
+        """End the stream."""
+        self._container.close()
+        self._hand_on()
+
+    def _hand_on(self) -> None:
+        content, self._written = bytes(self._written), bytearray()
+        for number, place in enumerate(range(0, len(content), _DATAGRAM), 1):
+            self._send(content[place : place + _DATAGRAM])
+            if number % _BURST == 0:
+                time.sleep(0.001)
