@@ -25,12 +25,13 @@ class MqttOutlet(KeptOutlet):
     def __init__(self, host: str, port: int, topic: str, login: tuple[str, str] | None, context: ssl.SSLContext | None):
         """Raise ImportError without paho-mqtt. context: that of TLS, None without TLS."""
         from paho.mqtt import client as mqtt
+        from paho.mqtt.enums import CallbackAPIVersion
 
         super().__init__()
         self._topic, self._told = topic, ""
         self._trouble = ""  # why there is no connection, set by the client's thread
         self._published = self._confirmed = 0
-        self._client: Client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._client: Client = mqtt.Client(CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
         self._client.connect_timeout = _CONNECT_S
         self._client.max_inflight_messages_set(_WAITING)
         self._client.max_queued_messages_set(_WAITING)
