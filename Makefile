@@ -1,14 +1,16 @@
-# A bare machine needs Python 3.11 and a package index. Everything else is installed into .venv.
+# A bare machine needs Python 3.11 and a package index. Everything else is installed into .venv: by `make demo` the package
+# with its own dependencies, by the other targets also the extras, which take minutes.
 PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 	$$name -c '' 2> /dev/null && { echo $$name; break; }; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
+BASE := $(VENV)/.installed-base
 STAMP := $(VENV)/.installed
 EXTRAS := torch,video,telemetry,elevation,grid,photos,export,train,tune,distributed,parquet,docs,dev
 
 .PHONY: demo test test-all test-python lint quick oldest onboard dist docs tutorials peers figures gpu
 
-demo: $(STAMP)
+demo: $(BASE)
 	$(BIN)/dddas demo --out demo-out
 
 # The checks that every change must pass: lint, types and the quick tests.
@@ -104,10 +106,14 @@ endif
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
 	@touch $@
 
-# The stamp avoids a second installation, until pyproject.toml changes.
-$(STAMP): pyproject.toml
+# The stamps avoid a second installation, until pyproject.toml changes.
+$(BASE): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "torchvision-dddas needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(STAMP): $(BASE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
