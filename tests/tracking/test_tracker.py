@@ -239,6 +239,7 @@ def test_every_change_of_whether_appearance_is_looked_at_is_an_adjustment_with_i
         ({"detections": np.full((1, 4), np.nan)}, "finite"),
         ({"detections": np.array([[0, 0, 0, 5.0]])}, "above 0 px, got 0 x 5 in box 0"),
         ({"detections": "boxes"}, "Detections record"),
+        ({"detections": walkers_table(4)}, r"DetectionTable of 8 rows; .* give table.at\(n\) for frame n"),
         ({"detections": np.ones((1, 4)), "camera_motion": np.eye(2)}, r"\(3, 3\) homography"),
         ({"detections": np.ones((1, 4)), "image": np.zeros((4, 4))}, "image must be uint8"),
         ({"detections": np.ones((1, 4)), "frame": 3}, "frame 3 follows frame 3"),

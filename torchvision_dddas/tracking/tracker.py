@@ -29,6 +29,7 @@ from torchvision_dddas.types import (
     as_picture,
     check_boxes,
     is_sampled,
+    refuse_table,
 )
 
 _MOST_CLASSES = 10_000  # number of identities whose class is kept; those seen longest ago are dropped
@@ -216,6 +217,7 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
     if isinstance(given, Detections):
         box, score = given.box_px, given.score
     else:
+        refuse_table(given)
         has_scores = isinstance(given, tuple) and len(given) == 2
         try:
             box = np.asarray(given[0] if has_scores else given, float)

@@ -1,7 +1,14 @@
 """The records that flow through the system, from frames to scenes and results. They use only NumPy."""
 
 from torchvision_dddas.types.arrays import Bool, Float, Int
-from torchvision_dddas.types.detections import Detections, DetectionTable, are_corners, check_boxes, share_orders
+from torchvision_dddas.types.detections import (
+    Detections,
+    DetectionTable,
+    are_corners,
+    check_boxes,
+    refuse_table,
+    share_orders,
+)
 from torchvision_dddas.types.frames import (
     Adjustment,
     Frame,
@@ -98,5 +105,6 @@ __all__ = [
     "identities_of",
     "is_sampled",
     "most_common",
+    "refuse_table",
     "share_orders",
 ]

@@ -55,6 +55,7 @@ class Detections(Boxes):
         are None count as 1. Classes are `data["class_name"]` (N,), or the names that `names` gives to the
         numbers. Raise InputError if boxes or scores are missing, have other shapes, or are refused by `check_boxes`.
         """
+        refuse_table(detections)
         given, names = detections, getattr(detections, "names", None)
         names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
         if hasattr(getattr(given, "boxes", None), "xyxy"):  # Results of ultralytics
@@ -290,3 +291,12 @@ class DetectionTable(Table):
         box_px, (label, class_id) = self.box_px[here], self.classes(here)
         area_px = box_px[:, 2] * box_px[:, 3]
         return Detections(box_px, self.score[here], area_px, kind="given", label=label, class_id=class_id)
+
+
+def refuse_table(given: object) -> None:
+    """Raise InputError if detections of one frame are given as a table of a clip, or as rows selected from it."""
+    if isinstance(given, DetectionTable):
+        raise InputError(
+            f"got a DetectionTable of {len(given)} rows; wanted the detections of one frame: give table.at(n) for "
+            "frame n, not the table or table[table.frame == n]"
+        )
