@@ -161,6 +161,18 @@ def test_tracks_of_data_sets_are_read(name, tmp_path):
     assert read.label is None or read.label[0] == classes[name]
 
 
+def test_visdrone_has_its_own_names_for_persons_and_motorcycles_and_others_for_boxes_without_a_class(tmp_path):
+    names = ("Person", "car", "motorcycle", "bike", "animal", "")
+    table = concat([part for name in names for part in tracks((1, 2), (name, name))])
+    notes = write_tracks(table, tmp_path / "a.txt", to="visdrone")
+    rows = [line.split(",") for line in (tmp_path / "a.txt").read_text().splitlines()]
+    categories = [row[7] for row in rows]
+    assert categories == [number for number in ("1", "4", "10", "3", "11", "11") for _ in range(4)]
+    assert "class Person is written as 1, pedestrian" in notes
+    assert any("VisDrone has no class animal: written as 11, others" in note for note in notes)
+    assert any("4 boxes without a class are written as 11, others" in note for note in notes)
+
+
 def test_identities_from_0_and_words_are_numbered_from_1_with_a_note(tmp_path):
     for identities, wanted in (([0, 2], [1, 3]), (["b", "a"], [1, 2])):
         boxes = [{"image_id": 1, "bbox": [9, 9, 5, 5], "track_id": identity} for identity in identities]

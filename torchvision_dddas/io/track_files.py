@@ -32,6 +32,8 @@ from torchvision_dddas.types import AerialLocations, DetectionTable, FrameResult
 
 _CSV = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, *CLASS_COLUMNS)
 _MOST_VALUES = 65535  # the largest value of a 16-bit mask
+# Names of other data sets for VisDrone's categories.
+_VISDRONE_NAMES = {"person": "pedestrian", "bike": "bicycle", "motorbike": "motor", "motorcycle": "motor"}
 
 Item = FrameResult | TrackedFrame | Tracks | Scene | AerialLocations
 """The results of one frame that can be written."""
@@ -171,10 +173,17 @@ def _write_mot(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> l
 def _write_visdrone(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
     """Write VisDrone text. The last columns are the category, and truncation and occlusion as unknown (-1)."""
     numbers = {name: number for number, name in enumerate(VISDRONE, 1)}
-    others = sorted({name or "unknown" for name in table.label.tolist() if name not in numbers})
-    category = np.array([numbers.get(name, len(VISDRONE) + 1) for name in table.label])
+    called = {name: _VISDRONE_NAMES.get(name.lower(), name.lower()) for name in set(table.label.tolist())}
+    category = np.array([numbers.get(called[name], len(VISDRONE) + 1) for name in table.label])
     save_file(path, MOT_TRACKS.format_rows({**_mot_rows(table), "x": category}).encode())
-    return [f"VisDrone has no class {', '.join(others)}: written as 11, others"] if others else []
+    renamed = sorted(name for name in called if name.lower() in _VISDRONE_NAMES)
+    notes = [f"class {name} is written as {numbers[called[name]]}, {called[name]}" for name in renamed]
+    uncounted = "written as 11, others, which the scores of VisDrone do not count"
+    if others := sorted(name for name in called if name and called[name] not in numbers):
+        notes.append(f"VisDrone has no class {', '.join(others)}: {uncounted}")
+    if "" in called:
+        notes.append(f"{(table.label == '').sum()} boxes without a class are {uncounted}")
+    return notes
 
 
 def _numbered_classes(table: Tracks, first: int) -> tuple[dict[int, str], np.ndarray]:

@@ -38,11 +38,13 @@ def truth_of(
     counts: np.ndarray,
     length: int,
     regions: TrackTable | None = None,
+    uncounted: str = "",
 ) -> ClipTruth:
     """Return the truth, with boxes of every frame up to the clip's length, or to the last labelled frame if it is 0.
 
     counts: (N,) which rows count; found boxes on the other rows are neither right nor false. regions: unlabelled
-    regions; rows in them do not count. Raise InputError for rows beyond the clip's end, and if no row counts.
+    regions; rows in them do not count. uncounted: the kinds of boxes that do not count, for the message. Raise
+    InputError for rows beyond the clip's end, and if no row counts.
     """
     last = int(table.frame.max()) if len(table.frame) else 0
     if length and last > length:
@@ -57,7 +59,7 @@ def truth_of(
             rows = by_frame.get(number, np.zeros(0, np.int64))
             counts[rows] &= ~lie_within(table.box_px[rows], region_px)
     if not counts.any():
-        raise InputError(f"{place} holds no box that counts")
+        raise InputError(f"{place} holds no box that counts{uncounted and ': '}{uncounted}")
     kept = table.at(counts)
     return ClipTruth(
         "boxes",

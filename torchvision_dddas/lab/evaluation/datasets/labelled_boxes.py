@@ -57,7 +57,9 @@ class VisDrone(Reader):
         table = table_of(place, rows["frame"], rows["identity"], rows.stack(*_CORNER_AND_SIZE), rows.line)
         category = np.array(self.categories)[rows["category"].astype(int) - 1]
         counts = np.isin(category, self.options["classes"]) & (rows["counts"] != 0)
-        return self._boxes_clip(name, place, pictures, truth_of(place, table, counts, len(pictures), regions), home)
+        uncounted = "categories 0 (regions) and 11 (others), rows marked 0, and classes beyond `classes` do not count"
+        truth = truth_of(place, table, counts, len(pictures), regions, uncounted)
+        return self._boxes_clip(name, place, pictures, truth, home)
 
 
 class Uavdt(Reader):
