@@ -50,6 +50,7 @@ def test_a_slow_machine_takes_the_first_quicker_configuration_that_keeps_up_with
     assert list(choose(look(rate_hz=5), live=True, quick_hz=20)[0]) == ["--config half"]
     options, remarks, _ = choose(look(rate_hz=5))
     assert options == {} and "without --live, no picture is dropped" in remarks[0]
+    assert "run --live with such a stream needs --config fast: the clip has 25 frames/s" in remarks[0]
 
 
 def test_no_configuration_without_settings_for_tiny_people_is_advised_where_they_are_tiny() -> None:

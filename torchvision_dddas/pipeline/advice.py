@@ -179,7 +179,8 @@ def choose_options(
     if live:
         options[f"--config {name}"] = slow
     else:
-        remarks.append(f"with --live, pictures would be dropped: {slow}; without --live, no picture is dropped")
+        need = f"run --live with such a stream needs --config {name}"
+        remarks.append(f"{need}: {slow}; for this file without --live, no picture is dropped")
     return options, remarks
 
 
