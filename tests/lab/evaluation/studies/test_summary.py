@@ -2,7 +2,9 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from torchvision_dddas.lab.evaluation.evaluate import evaluate
 from torchvision_dddas.lab.evaluation.metrics import bootstrap
 from torchvision_dddas.lab.evaluation.metrics.registry import HEADLINES, groups_of_task, is_lower_better, measure_names
 from torchvision_dddas.lab.evaluation.studies import runner, summary
+from torchvision_dddas.lab.evaluation.studies.records import TASKS
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 from torchvision_dddas.lab.evaluation.studies.summary import check_possible, goal_value, measures, parse_goal, summarize
 
@@ -146,6 +149,8 @@ def test_every_measure_can_be_a_goal_and_a_wrong_name_lists_the_right_ones() -> 
             assert parse_goal(f"{task}.{group}.{measure_names(group)[0]}").group == group
     for text, message in (
         ("f", "wanted task.group.measure"),
+        ("tracking.hota", r"'tracking\.hota' is not a measure; wanted .* did you mean tracking\.tracks\.hota"),
+        ("quality", "docs/tuning.md lists the measures"),
         ("sight.pixels.f", "not a task"),
         ("motion.pixels.n_tp", "neither more nor less"),
         ("motion.pixels.iou", "'iou' is not a measure of motion.pixels; wanted accuracy, "),
@@ -153,6 +158,19 @@ def test_every_measure_can_be_a_goal_and_a_wrong_name_lists_the_right_ones() -> 
     ):
         with pytest.raises(InputError, match=message):
             parse_goal(text)
+
+
+def test_the_page_on_tuning_lists_every_measure() -> None:
+    page = (Path(__file__).resolve().parents[4] / "docs/tuning.md").read_text(encoding="utf-8")
+    rows = [line for line in page.split("## Measures")[1].split("\n## ")[0].splitlines() if line.startswith("| `")]
+    listed = {
+        f"{group}.{name}"
+        for _, groups, names, _ in (row.split("|") for row in rows)
+        for group in re.findall("`(.+?)`", groups)
+        for name in re.findall("`(.+?)`", names)
+    }
+    pairs = [(task, group) for task in TASKS for group in groups_of_task(task)]
+    assert listed == {f"{task}.{group}.{name}" for task, group in pairs for name in measure_names(group)}
 
 
 def test_a_goal_that_the_truth_of_these_clips_does_not_allow_is_refused(tmp_path) -> None:

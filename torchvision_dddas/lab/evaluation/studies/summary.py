@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchvision_dddas.config import nearest
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.metrics import bootstrap, metres, tracking
@@ -335,7 +336,12 @@ def parse_goal(text: str, by: str = "pooled") -> Goal:
     """Return a goal from `task.group.measure`. Raise InputError for an unknown name, and for a mere count."""
     parts = text.split(".", 2)
     if len(parts) != 3 or not all(parts):
-        raise InputError(f"'{text}' is not a measure; wanted task.group.measure, such as motion.pixels.f")
+        names = [
+            f"{task}.{group}.{m}" for task in TASKS for group in groups_of_task(task) for m in measure_names(group)
+        ]
+        own = [name for name in names if name.startswith(f"{parts[0]}.")]
+        hint = nearest(text, own or names, "such as motion.pixels.f; docs/tuning.md lists the measures")
+        raise InputError(f"'{text}' is not a measure; wanted task.group.measure: {hint}")
     named, group, measure = parts
     task = next((known for known in TASKS if known == named), None)
     if task is None:
