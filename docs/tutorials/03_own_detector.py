@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 import torchvision_dddas as td
-from torchvision_dddas.io.overlay import colour_picture, identity_colour, label, rectangle
 from torchvision_dddas.lab.simulation import film_clip
 
 film_clip(Path("clip"), seed=3, frames=24, size_px=(480, 360))
@@ -45,11 +44,7 @@ results = list(td.Pipeline(detector=detect)("clip/frames"))
 for result in results[10:13]:
     print(result.number, dict(zip(result.tracks.id.tolist(), result.tracks.label, strict=True)))
 
-shown = results[12]
-picture = colour_picture(shown.frame.image)
-for identity, box, name in zip(shown.tracks.id.tolist(), shown.tracks.box_px, shown.tracks.label, strict=True):
-    rectangle(picture, box, identity_colour(identity), 2)
-    label(picture, box, f"{name} {identity}", identity_colour(identity))
+picture = td.draw(results[12].frame, results[:13])  # the earlier results make the trails
 cv2.imwrite("03_own_detector.jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 75])
 
 # %%
@@ -58,8 +53,8 @@ cv2.imwrite("03_own_detector.jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 75])
 # ## Boxes from a file
 #
 # Boxes that are already on disk need no Python: `dddas run clip.mp4 --detections boxes.csv` reads them, and
-# [the commands' page](/commands.md) lists the tables that it understands. In Python, give the tracker the record of
-# another library:
+# [the commands' page](/commands.md) lists the tables that it understands. In Python, `td.read_detections` reads them,
+# and `table.at(n)` are the detections of frame n. Or give the tracker the record of another library:
 
 tracker = td.Tracker(size=(480, 360))
 settled = []

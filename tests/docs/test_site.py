@@ -83,7 +83,7 @@ def test_a_tutorial_runs_and_makes_its_picture(script: Path, tmp_path: Path) -> 
 def test_a_quick_start_can_be_followed(page: str, tmp_path: Path) -> None:
     variables = {**environ(), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     text = (DOCS / "quickstart" / f"{page}.md").read_text(encoding="utf-8")
-    for named, block in re.findall(r"`(\w+\.toml)`[^`]*```toml\n(.*?)```", text, re.DOTALL):
+    for named, block in re.findall(r"`(\w+\.(?:toml|geojson))`[^`]*```(?:toml|json)\n(.*?)```", text, re.DOTALL):
         (tmp_path / named).write_text(block)
     lines = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
     lines = [line for line in lines if line.startswith("dddas ") and not any(word in line for word in OWN)]
@@ -91,7 +91,7 @@ def test_a_quick_start_can_be_followed(page: str, tmp_path: Path) -> None:
     for line in lines:
         done = subprocess.run(shlex.split(line), cwd=tmp_path, env=variables, capture_output=True, text=True)
         assert done.returncode == 0, f"{line}: {done.stderr}"
-    for name in re.findall(r"`((?:found|default|fast)/[\w.]+)`", text):
+    for name in re.findall(r"`((?:found|zoned|default|fast|sweep)/[\w.]+)`", text):
         assert (tmp_path / name).exists()
 
 
