@@ -129,6 +129,18 @@ def test_a_moving_camera_and_a_zone_outside_the_picture_are_noted_once():
     assert not still.notes
 
 
+def test_a_zone_that_is_near_only_with_swapped_coordinates_is_noted_once():
+    origin = (16.37, 48.2)
+    square = lonlat(SQUARE, origin)
+    for corners, count in ((square[:, ::-1], 1), (square, 0), (square + np.array([30, 0]), 0)):
+        zones = Zones(polygons={"yard": corners, "field": corners})
+        events(zones, walk(eastward, origin=origin))
+        assert len(zones.notes) == count
+    swapped = Zones(polygons={"yard": square[:, ::-1]})
+    events(swapped, walk(eastward, origin=origin))
+    assert "yard lies" in swapped.notes[0] and "0.0 km with latitude and longitude swapped" in swapped.notes[0]
+
+
 def test_targets_that_have_gone_take_no_memory():
     zones = Zones(polygons=[SQUARE], unit="m")
     list(zones.mark(walk(lambda t: (1, 1) if t < 2 else None, lambda t: (9, 9), seconds=70)))

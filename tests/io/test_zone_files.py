@@ -124,6 +124,7 @@ CROSSED = [RING[0], RING[2], RING[1], RING[3]]
         (collection(feature("LineString", [[0, 0], [1e400, 0]])), "not finite"),
         (collection(feature("LineString", [[0, 0], [640, 480]])), '"unit"'),
         (collection(feature("LineString", [[32.2, -110.9], [32.3, -110.9]])), "longitude, latitude"),
+        (collection(feature("LineString", [[32.2, -110.9], [32.3, -110.9]])), r"swapped\? write the longitude first"),
         (collection(feature("Polygon", [[[k / 1000, k * k / 1e8] for k in range(2001)]])), "2000 at most"),
         (collection(feature("Polygon", [RING]), unit="feet"), "unit of zones"),
         (collection(feature("Polygon", [RING]), crs={"properties": {"name": "EPSG:25832"}}), "WGS84"),

@@ -21,6 +21,7 @@ _SIGMAS = 4.0  # margin in standard deviations of the jitter
 _APART_S = 0.5  # the jitter of places this far apart in time is independent
 # Standard deviation of a place without a covariance; in the picture, as a share of the box's height.
 _UNKNOWN_M, _BOX_SHARE = 1.0, 0.2
+_FAR_M, _NEAR_M = 1e6, 1e5  # distances from the run of a zone with swapped coordinates, as given and swapped back
 _MOST_SHARE = 0.25  # widest margin as a share of a zone's size
 
 
@@ -119,7 +120,7 @@ class Zones:
         self._edges: dict[str, geometry.Edges] = {}
         self._widest: dict[str, float] = {}
         self._moved = np.eye(3)
-        self._is_first = True
+        self._is_first, self._is_order_checked = True, False
 
     def check(self, is_located: bool, origin_deg: tuple[float, float] | None) -> None:
         """Raise InputError for zones on the ground if a run has no such places."""
@@ -248,6 +249,8 @@ class Zones:
             self.check(located is not None, origin)
             for zone in self.zones:
                 self._place(zone, origin)
+            if origin is not None and not self._is_order_checked:
+                self._check_order(origin)
             self._origin, self._targets = origin, {}
         if self._is_first and result.frame is not None:
             self._is_first = False
@@ -270,6 +273,21 @@ class Zones:
             # Twice the area over the border's length is the radius of a disc, or half the side of a square.
             sizes.append(length if zone.is_line else 2 * geometry.area_of(ring) / max(length, 1e-9))
         self._widest[zone.name] = _MOST_SHARE * min(sizes)
+
+    def _check_order(self, origin: tuple[float, float]) -> None:
+        """Note the first zone that lies far from the run, but near to it with latitude and longitude swapped."""
+        self._is_order_checked = True
+        for zone in self.zones:
+            middle = np.concatenate(zone.rings).mean(axis=0)
+            if zone.unit != "deg" or abs(middle[0]) > 90:
+                continue
+            given_m, swapped_m = geometry.great_circle_m(np.array([middle, middle[::-1]]), np.array(origin)).tolist()
+            if given_m > _FAR_M and swapped_m < _NEAR_M:
+                self.notes.append(
+                    f"{zone.name} lies {given_m / 1000:.0f} km from the run, and {swapped_m / 1000:.1f} km with "
+                    "latitude and longitude swapped: write the longitude first"
+                )
+                return
 
     def _check_camera(self, motion: np.ndarray | None) -> None:
         """Note once how far a camera with zones in pixels has moved, if the distance matters."""

@@ -94,9 +94,11 @@ def make_zone(name: str, lines: Any, is_line: bool, unit: str = "deg", dwell_s: 
         unit == "deg"
         and (far := next((p for ring in rings for p in ring if (abs(p) > (180, 90)).any()), None)) is not None
     ):
+        fits = all((abs(ring) <= (90, 180)).all() for ring in rings)
         raise InputError(
-            f"{name} has a place at {far[0]:g}, {far[1]:g}; wanted longitude, latitude in degrees. For other "
-            'coordinates, set the member "unit" of the GeoJSON to "px" or "m"'
+            f"{name} has a place at {far[0]:g}, {far[1]:g}; wanted longitude, latitude in degrees"
+            f"{' (are they swapped? write the longitude first)' if fits else ''}. For other coordinates, set the "
+            'member "unit" of the GeoJSON to "px" or "m"'
         )
     if not is_line and any(map(crosses_itself, rings)):
         raise InputError(f"{name} crosses itself, so its inside is undefined; draw its outline without crossings")
