@@ -141,6 +141,10 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
             "1,104.1,101.9,144.1,131.9,0.9,2\n2,108.3,103.9,148.1,133.9,0.9,2",
             "every height is below 1 px; wanted frame",
         ),
+        (
+            "1,104.1,101.9,144.1,131.9,0.9,2\n2,108.3,103.9,148.1,133.9,0.9,2",
+            "frame,id,x1,y1,x2,y2[,score] with --box-format xyxy, or a first line",
+        ),
         ("1,104.1,101.9,144.1,131.9,9,2\n2,108.3,103.9,148.1,133.9,9,2", "the second column holds no identities"),
         ("".join(f"{k},2,0.9,104,101,40,30\n" for k in range(1, 7)), "every x is below 1 px"),
         (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
@@ -372,12 +376,14 @@ OWN = replace(rows_on([1, 2, 3], score=0.5), own=True)
             (rows_on([1, 2, 3], box), 1, clip(3), ["3 boxes lie wholly outside"])
             for box in ((-9, 10, 9, 5), (64, 9, 5, 5))
         ),
+        (rows_on([1, 2, 3], (20, 55, 5, 5)), 1, clip(3), ["are x and y swapped?"]),
         *((rows_on([1, 2, 3], box), 1, clip(3), []) for box in ((-8.5, 10, 9, 5), (63.5, 9, 5, 5), (10, 47.5, 5, 5))),
     ],
 )
 def test_what_is_left_out_or_read_in_an_unexpected_way_is_noted(table, interval, source, notes):
     found = check_table(table, interval, source)
     assert len(found) == len(notes) and all(words in note for words, note in zip(notes, found, strict=True))
+    assert all("swapped" in words for words, note in zip(notes, found, strict=True) if "swapped" in note)
 
 
 def test_a_table_of_another_clip_or_interval_is_refused():

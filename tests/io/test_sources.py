@@ -126,7 +126,8 @@ def cut_mp4(folder):
 @pytest.mark.parametrize("name", ["clip.mp4", "clip.avi", "clip.txt"])
 def test_a_file_that_is_no_video_gets_one_line_and_no_word_of_a_decoder(refused, tmp_path, capfd, name, content):
     data = content if isinstance(content, bytes) else content(tmp_path)
-    assert name in refused(open_source, data, name)
+    message = refused(open_source, data, name)
+    assert name in message and ("CLIP --detections" in message) == (name == "clip.txt")
     assert capfd.readouterr() == ("", "")
 
 

@@ -25,6 +25,7 @@ _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
 # A stream is the cover of a file if it is marked as an attached picture, a thumbnail or a still image, or if it holds a
 # single picture in one of the codecs of pictures.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
+_TABLES = (".csv", ".txt", ".json", ".xml", ".parquet")  # the endings of tables of boxes
 # The variable with FFmpeg's options for streams, `name;value|name;value`, and its default. Both are as in OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
@@ -72,7 +73,7 @@ def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
     code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
     if code.decode("latin-1") in _TEXT_AS_VIDEO:
         capture.release()
-        raise InputError(f"{name} is a text file, not a video")
+        raise InputError(f"{name} is a text file, not a video; {_as_boxes(name)}")
     _check_size(
         target, name, *(int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     )
@@ -114,7 +115,7 @@ class AvCapture:
         films = [video for video in videos if not _is_cover(video)] or videos
         if not films or films[0].codec_context.name in _TEXT_AS_VIDEO:
             self._container.close()
-            raise InputError(f"{name} is {'a text file, ' if films else ''}not a video")
+            raise InputError(f"{name} is {f'a text file, not a video; {_as_boxes(name)}' if films else 'not a video'}")
         _check_size(target, name, films[0].width, films[0].height)
         self._video, self._reformatter = films[0], cast(Any, VideoReformatter())
         self._tick_s = float(self._video.time_base or 0)
@@ -268,7 +269,13 @@ def _is_cover(video: Any) -> bool:
 def _refusal(target: str | int, name: str) -> str:
     live = is_live(target)
     what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
+    if not live and Path(str(target)).suffix.lower() in _TABLES:
+        return f"cannot open {what}; {_as_boxes(name)}"
     return f"cannot open {what}; " + ("is it there?" if live else "it is damaged or not a video file")
+
+
+def _as_boxes(name: str) -> str:
+    return f"give boxes beside their clip: CLIP --detections {name}"
 
 
 def _read_options() -> dict[str, str]:

@@ -243,7 +243,8 @@ def _check_columns(identity: np.ndarray, box_px: np.ndarray, path: str | Path) -
         what = ["x", "y", "width", "height"][int(is_small.argmax())] if is_small.any() else ""
         raise InputError(
             f"detections {path}: {f'every {what} is below 1 px' if what else 'the second column holds no identities'}; "
-            "wanted frame,id,x,y,w,h[,score], or a first line that names the columns"
+            "wanted frame,id,x,y,w,h[,score], or frame,id,x1,y1,x2,y2[,score] with --box-format xyxy, or a first line "
+            "that names the columns, such as frame,x1,y1,x2,y2,score"
         )
 
 
@@ -375,7 +376,12 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
     if source is not None:
         low, high = table.box_px[:, :2], table.box_px[:, :2] + table.box_px[:, 2:]
         if outside := int(((high <= 0) | (low >= source.size)).any(axis=1).sum()):
-            notes.append(f"{outside} boxes lie wholly outside the picture; they are tracked like the others")
+            swapped, size = low[:, ::-1], np.array(source.size)
+            fits = 10 * outside > len(table) and ((swapped >= 0) & (swapped < size)).all()
+            notes.append(
+                f"{outside} boxes lie wholly outside the picture; they are tracked like the others"
+                f"{'; are x and y swapped?' if fits else ''}"
+            )
     return notes
 
 
