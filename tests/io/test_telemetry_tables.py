@@ -671,6 +671,10 @@ def test_thousands_with_points_quoted_decimal_commas_and_blanks_between_cells_ar
         ("2022-08-26 18:12:47.00: GPS {TimeUS : 0, Lat : 48.1}\n", "mavlogdump.py --format csv"),
         ("latitude,longitude,rel_alt\n1,2,3\n", "lacks a time; its columns are latitude, longitude, rel_alt"),
         ("time_s,battery\n0,5\n1,5\n", "nothing in it (table of another program) holds a place"),
+        (
+            "time_s,x_px,y_px\n0,5,6\n1,5,6\n",
+            "wanted some of the columns time_s, latitude_deg, longitude_deg, altitude_m",
+        ),
         ("battery,voltage\n0,5\n1,5\n", "names none of time_s, altitude_m"),
         ("time_s,lat,lon\n", "has a header but no rows"),
         ("time_s,lat,lon\nx,1,2\ny,1,2\n", "line 2: 'x' is not a time"),

@@ -144,7 +144,9 @@ def build_record(
         log.note(f"the log states the error of its places: the median sigma is {middle_m:.2g} m, east and north")
     _split_flights(log, samples)
     if not set(samples) - _NOT_ALONE:
-        raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
+        names = "time_s, latitude_deg, longitude_deg, altitude_m, heading_deg, pitch_deg"
+        wanted = f"; wanted some of the columns {names}" if log.kind.startswith("table of") else ""
+        raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera{wanted}")
     _note_altitude(log, samples)
     _note_silence(log, samples)
     times = _with_gaps(log, np.unique(np.concatenate([rows[:, 0] for rows in (moments, *samples.values())])))
