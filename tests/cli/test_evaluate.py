@@ -208,7 +208,7 @@ def test_a_film_names_its_true_boxes_and_small_boxes_name_the_option_for_them(dd
     found = file("found/tracks.txt", "".join(f"{n},1,{n + 2},1,6,6,1,-1,-1,-1\n" for n in range(1, 9)))
     assert f"{truth} holds the true boxes" in bad(dddas("evaluate", truth.parent.parent, found))
     said = dddas("evaluate", truth, found).stdout
-    assert "8 more of 8 are met from IoU 0.2 on than from 0.5; --iou 0.2 counts" in said.replace("\n", " ")
+    assert "IoU 0.2 finds 8 more of 8 boxes than IoU 0.5; --iou 0.2 counts" in said.replace("\n", " ")
     assert measures(found.parent)["clips"]["tracks"]["tracks"]["recall"] == 0
     done = dddas("evaluate", truth, found, "--iou", 0.2)
     assert "note: boxes count as found from IoU 0.2 on" in done.stdout
