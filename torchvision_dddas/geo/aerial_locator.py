@@ -453,7 +453,7 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
         best = int(counts.argmax())
         missing = LEAST - int(counts[best])
         raise InputError(
-            f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has most, {counts[best]}: "
+            f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has {counts[best]}, the most: "
             f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
         )
     enough = np.flatnonzero(counts >= LEAST).tolist()
