@@ -92,7 +92,8 @@ def simulate(
         served = ServeOptions(serve, serve_mavlink, 1.0 if speed is None else speed, link, tuple(fault or ()))
     elif speed is not None or link is not None or fault:
         raise InputError("--speed, --link and --fault are for a served world: give --serve or --serve-mavlink")
-    save = save or ("frames,masks,ground" if served is None else "none")
+    if save is None:
+        save = "frames,masks,ground" if served is None else "none"
     chosen, kinds = load_scenario(scenario, set_ or [], seed), parse_save(save, RECORDED)
     record = record_scenario(out, chosen, kinds, frames, scenario, partial(progress, quiet=quiet), served)
     print_lines(_summary(record, out, chosen), quiet)
