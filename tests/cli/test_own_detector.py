@@ -42,6 +42,26 @@ def test_boxes_and_classes_are_those_of_the_network(dddas, made, tmp_path, comma
     assert ("scale:" in result.stdout) == bool(more)
 
 
+@pytest.mark.parametrize("command", ["detect", "track", "run", "run --live"])
+def test_settings_of_the_motion_detector_without_effect_are_named(dddas, made, tmp_path, command):
+    (tmp_path / "plain.toml").write_text("[morphology]\nhull = false\n[registration]\nkeypoints = 300\n")
+    given = (*made, "--set", "difference.threshold=3", "--config", tmp_path / "plain.toml")
+    for more in ((), ("--movers",)):
+        out = tmp_path / f"out{len(more)}"
+        result = dddas(*command.split(), *given, *more, "--out", out)
+        assert result.exit_code == 0, result.output
+        file = next(out.glob("**/run.json"))
+        notes = [note for note in json.loads(file.read_text())["notes"] if "no effect" in note]
+        assert [note.partition(" have")[0] for note in notes] == ["difference.threshold, morphology.hull"] * (not more)
+
+
+def test_settings_of_the_motion_detector_have_no_effect_on_a_table(dddas, tmp_path):
+    (tmp_path / "boxes.txt").write_text("".join(f"{k},-1,{40 + k},60,20,20,0.9\n" for k in range(1, 5)))
+    options = ("--detections", tmp_path / "boxes.txt", "--set", "refine.on=false", "--out", tmp_path)
+    assert dddas("track", *options).exit_code == 0
+    assert "refine.on has no effect, because" in str(record(tmp_path)["notes"])
+
+
 def test_live_results_have_the_classes_of_the_network(dddas, made, tmp_path):
     words = ("--live", "--set", "live.pace=0", "--quiet")
     assert dddas("run", *made, *words, "--out", tmp_path).exit_code == 0

@@ -93,7 +93,7 @@ def detect_clip(
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import DetectionRecorder, clip_facts
-    from torchvision_dddas.pipeline import clip_notes, find_scenes, note_uncovered, prepare_detection
+    from torchvision_dddas.pipeline import clip_notes, find_scenes, note_uncovered, note_unused, prepare_detection
 
     given = [Path(clip), *([network.path] if network is not None else [])]
     refuse_own_input(given, [folder / name for name in DetectionRecorder.files], "folder with --out")
@@ -113,6 +113,7 @@ def detect_clip(
         record.notes += [*notes, *(network.notes if network is not None else ())]
         if network is not None and not movers:
             record.scale = None  # the scale belongs to the search for movers
+            record.notes += note_unused(settings)
         found = find_scenes(source, settings, engine, flight, network, movers)
         scenes = note_uncovered(found, flight, record.notes)
         record_results(output, record, scenes, source.name, source.count, quiet, source)

@@ -272,7 +272,15 @@ def run(
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.joined_clips import JoinedSource
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
-    from torchvision_dddas.pipeline import Pipeline, assemble_files, clip_notes, locator_facts, map_site, open_uav
+    from torchvision_dddas.pipeline import (
+        Pipeline,
+        assemble_files,
+        clip_notes,
+        locator_facts,
+        map_site,
+        note_unused,
+        open_uav,
+    )
 
     names = parse_save(save, PipelineRecorder.saved)
     beside_clip = [path for path in (zones, detections, detector, classes) if path is not None]
@@ -323,6 +331,9 @@ def run(
         if not finds_movers:
             record.scale = None  # this scale belongs to the motion detector
         record.notes += [*ready.notes, *checked]
+        if not finds_movers and not aerial:  # the pictures of further UAVs are searched for motion
+            # The landmarks' own blobs are cut out by this size.
+            record.notes += note_unused(settings, ("small.min_area_px",) if landmarks is not None else ())
         count = None if source.count is None else -(-source.count // interval)
         pipeline = Pipeline.from_assembly(ready, interval=interval, detector=boxes, movers=movers)
         results = pipeline(source) if team is None else team.mark(pipeline(source))

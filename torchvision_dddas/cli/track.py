@@ -78,7 +78,7 @@ def track(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
-    from torchvision_dddas.pipeline import clip_notes, prepare_detection
+    from torchvision_dddas.pipeline import clip_notes, note_unused, prepare_detection
     from torchvision_dddas.types import is_sampled
 
     settings, names = load_settings(config, set_, ignore, quiet), parse_save(save, TrackRecorder.saved)
@@ -121,6 +121,7 @@ def track(
         rate_hz, size = (source.rate_hz, source.size) if source is not None else (10.0, (1, 1))
         record = output.begin(facts, rate_hz / interval, size)
         record.notes += notes
+        record.notes += note_unused(settings) if table is not None or (network is not None and not movers) else []
         if network is not None and not movers:
             record.scale = None  # the scale belongs to the search for movers
         last = source.count if source is not None else table.last if table is not None else None

@@ -60,12 +60,15 @@ from torchvision_dddas.pipeline import (
     completion,
     locator_facts,
     map_site,
+    note_unused,
 )
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry
 
 _WAITING = "waiting for the camera"
+# Parameters of the motion detector that landmarks and a commanded vehicle use too.
+_SHARED = ("small.min_area_px", "gates.expected_size_m", "gates.focal_px")
 _CLEAR = "\r\x1b[K"
 _COUNTED = (
     *("captured", "dropped", "looked_at", "undecoded", "concealed", "reconnects", "clock_jumps"),
@@ -109,6 +112,7 @@ def run_live(
     if backend == "auto":  # the torch engine finishes frames in batches, which would delay live results
         backend = "onboard"
     # Measure O of the interval rule unless it is set; without a pace frames wait, so that every run gives the same.
+    unused = note_unused(settings, _SHARED) if detector is not None and not movers and not aerial else []
     if settings.live.pace and not is_set(settings, "interval.cost"):
         settings = with_parameters(settings, {"interval.cost": 0.0})
     health, supervisor, live = Health(), Supervisor(), settings.live
@@ -176,7 +180,7 @@ def run_live(
 
         ready = prepare()
         ready.notes.extend([str(source.levels)] if source.levels else [])
-        ready.notes.extend(detector.notes if detector is not None else ())
+        ready.notes.extend([*detector.notes, *unused] if detector is not None else ())
         flight, is_recording, offset_s = ready.telemetry, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
         if zones is not None:

@@ -16,6 +16,7 @@ from torchvision_dddas.pipeline.assembly import (
     read_locator,
 )
 from torchvision_dddas.pipeline.further_uavs import open_uav, prepare_uav
+from torchvision_dddas.pipeline.own_detector import note_unused
 from torchvision_dddas.pipeline.pipeline import ClipSource, Pipeline, find_scenes
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "locator_facts",
     "map_site",
     "note_uncovered",
+    "note_unused",
     "open_uav",
     "prepare_detection",
     "prepare_uav",

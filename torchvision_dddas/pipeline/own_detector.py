@@ -1,12 +1,13 @@
 """Scenes from the user's own detector or table of boxes, instead of the motion detector."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.config import Settings, changes
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.tracking import CameraMotion, Registrar
 from torchvision_dddas.types import Detections, DetectionTable, Frame, Registration, Scene, as_picture, is_sampled
@@ -68,3 +69,19 @@ def run_detector(detect: Detector | DetectionTable, frame: Frame) -> Detections:
         )
     # Scores of targets found by their motion would count as certain.
     return replace(found, kind="given") if isinstance(found, Detections) else Detections.from_supervision(found)
+
+
+_OF_MOTION = ("interval", "difference", "morphology", "refine", "tracklets", "small", "history", "gates")
+"""The groups of settings that only the motion detector uses."""
+
+
+def note_unused(settings: Settings, used: Sequence[str] = ()) -> list[str]:
+    """Return a note on changed settings that have no effect without the motion detector.
+
+    used: parameters of these groups that another part of the run uses.
+    """
+    names = [name for name in changes(settings) if name.split(".")[0] in _OF_MOTION and name not in used]
+    if not names:
+        return []
+    verb = "has" if len(names) == 1 else "have"
+    return [f"{', '.join(names)} {verb} no effect, because the boxes are given and no motion is searched for"]
