@@ -114,16 +114,40 @@ def test_a_table_without_tracks_becomes_empty_masks(tmp_path):
     assert [file.name for file in (tmp_path / "masks").iterdir()] == ["000001.png"]
 
 
+@pytest.mark.parametrize(
+    ("names", "frames", "lacking"),
+    [
+        (("a/1.png", "b/1.png"), [1, 2], 1),
+        (("7.png", "last.png"), [1, 2], 1),
+        (("7.png", "3.png"), [7, 3], 0),
+    ],
+)
+@pytest.mark.parametrize("program", ["coco", "cvat"])
+def test_a_note_says_that_the_order_of_pictures_gives_the_frames(program, names, frames, lacking, tmp_path):
+    images = [{"id": k, "file_name": name} for k, name in enumerate(names)]
+    boxes = [{"image_id": k, "bbox": [9, 9, 5, 5], "score": 0.1 * frame} for k, frame in enumerate(frames)]
+    box = "<box label='a' xtl='9' ytl='9' xbr='14' ybr='14'/>"
+    text = "".join(f"<image name='{name}'>{box}</image>" for name in names)
+    file = tmp_path / {"coco": "a.json", "cvat": "a.xml"}[program]
+    coco = json.dumps({"images": images, "annotations": boxes})
+    file.write_text(coco if program == "coco" else f"<annotations>{text}</annotations>")
+    read: Any = read_detections(file)
+    assert read.frame.tolist() == sorted(frames)
+    assert [note.partition(" have")[0] for note in read.notes] == [f"{lacking} of 2 pictures"] * bool(lacking)
+
+
 def test_results_of_a_detector_in_cocos_format_are_read(tmp_path):
     box = {"image_id": 3, "category_id": 2, "bbox": [1, 2, 3, 4], "score": 0.5}
     (tmp_path / "a.json").write_text(json.dumps([box]))
     read: Any = read_detections(tmp_path / "a.json")
     assert (read.frame[0], read.box_px[0].tolist(), read.label[0], read.identity[0]) == (3, [1, 2, 3, 4], "2", -1)
+    assert read.notes == ("the file lists no images: each image_id is taken as the number of a frame",)
 
 
 def test_what_is_left_out_of_other_formats_is_noted(tmp_path):
     boxes = [{"image_id": 1, "bbox": [9, 9, 5, 5], "iscrowd": crowd} for crowd in (0, 1)]
-    (tmp_path / "a.json").write_text(json.dumps(boxes))
+    images = [{"id": 1, "file_name": "1.png"}]
+    (tmp_path / "a.json").write_text(json.dumps({"images": images, "annotations": boxes}))
     read: Any = read_detections(tmp_path / "a.json")
     assert len(read) == 1 and read.notes == ("1 boxes of crowds (iscrowd) are left out",)
     regions = "<ignored_region><box left='0' top='0' width='9' height='9'/></ignored_region></sequence>"

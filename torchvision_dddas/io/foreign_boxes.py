@@ -44,12 +44,13 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
     Cells are those of the known COLUMNS. pictures: the names of the clip's pictures without endings, in order; by
     default, the numbers in file names are frames. Raise InputError with the file and the number of the box.
     """
+    said: list[str] = []
     if os.path.isdir(path):  # noqa: PTH112 (pathlib raises for a name that no file can have)
         files = sorted(path.glob("*.png"), key=lambda file: natural_order(file.name))
         if not files or any(file.suffix == ".txt" for file in path.iterdir()):
             return None
-        return _cells(path, _read_masks(files, pictures))
-    said: list[str] = []
+        text, notes = _cells(path, _read_masks(files, pictures, said))
+        return text, notes + said
     readers: dict[str, _Reader] = {".json": _read_json, ".xml": _read_xml}
     if (reader := readers.get(path.suffix.lower())) is None:
         return None
@@ -58,7 +59,7 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
     except OSError as error:
         raise InputError(f"detections {path} cannot be read: {error.strerror}") from None
     text, notes = _cells(path, reader(content, pictures, said))
-    return text, said + notes
+    return text, notes + said
 
 
 def name_columns(path: Path, text: CsvText) -> tuple[CsvText, list[str]] | None:
@@ -126,8 +127,11 @@ def _number_identities(given: list[Any]) -> tuple[list[int | None], list[str]]:
     return [None if identity is None else numbers[str(identity)] for identity in given], notes
 
 
-def frames_of(names: Sequence[str], pictures: Sequence[str]) -> list[int]:
-    """Return the frame, from 1, of each picture: its place in the clip, else the number in its name, else its order."""
+def frames_of(names: Sequence[str], pictures: Sequence[str], said: list[str]) -> list[int]:
+    """Return the frame, from 1, of each picture: its place in the clip, else the number in its name, else its order.
+
+    said: takes a note if the order decides.
+    """
     stems = [Path(name).stem for name in names]
     places = {name: number for number, name in enumerate(pictures, 1)}
     if places and set(stems) <= set(places):
@@ -135,6 +139,11 @@ def frames_of(names: Sequence[str], pictures: Sequence[str]) -> list[int]:
     ends = [re.search(r"[0-9]{1,9}$", stem) for stem in stems]
     numbers = [int(end[0]) for end in ends if end]
     if len(set(numbers)) < len(stems):
+        lacking = len(stems) - len(set(numbers))
+        said.append(
+            f"{lacking} of {len(stems)} pictures have no number of their own at the end of their names: the order of "
+            "the pictures in the file gives the frames"
+        )
         return list(range(1, len(stems) + 1))
     return [number + (min(numbers) == 0) for number in numbers]
 
@@ -161,8 +170,10 @@ def _read_coco(data: dict[str, Any], pictures: Sequence[str], said: list[str]) -
         first = min(image["frame_id"] for image in images)
         numbers = [image["frame_id"] + (first == 0) for image in images]
     else:
-        numbers = frames_of([str(image["file_name"]) for image in images], pictures)
+        numbers = frames_of([str(image["file_name"]) for image in images], pictures, said)
     frames = {image["id"]: number for image, number in zip(images, numbers, strict=True)}
+    if data["annotations"] and not images:
+        said.append("the file lists no images: each image_id is taken as the number of a frame")
     names = {category["id"]: category["name"] for category in data.get("categories", [])}
     if crowds := sum(bool(box.get("iscrowd")) for box in data["annotations"]):
         said.append(f"{crowds} boxes of crowds (iscrowd) are left out")
@@ -198,10 +209,10 @@ def _read_xml(content: bytes, pictures: Sequence[str], said: list[str]) -> Itera
         said.append(f"{regions} ignored regions of UA-DETRAC are left out")
     if root.tag not in ("sequence", "annotations"):
         raise ValueError(f"the XML begins with <{root.tag}>; wanted <annotations> of CVAT or <sequence> of UA-DETRAC")
-    yield from _read_detrac(root) if root.tag == "sequence" else _read_cvat(root, pictures)
+    yield from _read_detrac(root) if root.tag == "sequence" else _read_cvat(root, pictures, said)
 
 
-def _read_cvat(root: ElementTree.Element, pictures: Sequence[str]) -> Iterator[Row]:
+def _read_cvat(root: ElementTree.Element, pictures: Sequence[str], said: list[str]) -> Iterator[Row]:
     """Read CVAT for video 1.1, whose frames count from 0, or CVAT for images, which has no identities.
 
     Source: docs.cvat.ai, XML annotation format.
@@ -216,7 +227,7 @@ def _read_cvat(root: ElementTree.Element, pictures: Sequence[str]) -> Iterator[R
             if box.get("outside", "0") == "0":
                 yield int(box.attrib["frame"]) + 1, track.attrib["id"], *place(box), None, None, track.get("label")
     images = list(root.iter("image"))
-    frames = frames_of([image.attrib["name"] for image in images], pictures)
+    frames = frames_of([image.attrib["name"] for image in images], pictures, said)
     for frame, image in zip(frames, images, strict=True):
         for box in image.iter("box"):
             yield frame, None, *place(box), None, None, box.get("label")
@@ -234,11 +245,12 @@ def _read_detrac(root: ElementTree.Element) -> Iterator[Row]:
             yield int(frame.attrib["num"]), target.attrib["id"], *place, None, None, label
 
 
-def _read_masks(files: Sequence[Path], pictures: Sequence[str]) -> Iterator[Row]:
+def _read_masks(files: Sequence[Path], pictures: Sequence[str], said: list[str]) -> Iterator[Row]:
     """Yield the extent of the pixels of each value of a mask as a box. The value 0 is background."""
     from scipy import ndimage  # imported here, because it would slow down the start of every run
 
-    for frame, file in zip(frames_of([file.name for file in files], pictures), files, strict=True):
+    frames = frames_of([file.name for file in files], pictures, said)
+    for frame, file in zip(frames, files, strict=True):
         mask = read_mask(file)
         palette = _palette(file.read_bytes())
         values, places = np.unique(mask, return_inverse=True)
