@@ -52,7 +52,11 @@ def test_classes_of_another_detector_stay_with_their_rows(classes, label):
     found = Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=None, **classes))
     assert found.label.tolist() == label
     assert found[::-1].label.tolist() == label[::-1] and found[np.array([False, True])].label.tolist() == label[1:]
-    assert Detections.concat([found, Detections(found.box_px, found.score)]).label.tolist() == [*label, "", ""]
+    assert Detections.concat([found, Detections(found.box_px, found.score, kind="given")]).label.tolist() == [
+        *label,
+        "",
+        "",
+    ]
 
 
 def test_classes_go_to_supervision_by_the_names_that_it_has_for_them(monkeypatch):
@@ -135,11 +139,14 @@ def test_a_table_is_sliced_by_a_number_and_goes_row_by_row():
 
 
 def test_tables_that_mean_something_else_are_not_joined():
-    assert len(Telemetry.concat([LOG[:2], LOG[2:]])) == 3
+    assert len(Telemetry.concat([LOG[:2], LOG[2:]])) == len(Telemetry.concat(row for row in LOG)) == 3
     with pytest.raises(InputError, match=r"must have the same geographic$"):
         Telemetry.concat([LOG[:2], replace(LOG[2:], geographic=False)])
     with pytest.raises(InputError, match=r"must have the same lonlat_deg$"):
         Positions.concat([Positions(), Positions(lonlat_deg=np.zeros((0, 2)))])
+    found = Detections(CORNERS, np.ones(2))
+    with pytest.raises(InputError, match="must have the same kind, got moving and given; "):
+        Detections.concat([found, replace(found, kind="given")])
     with pytest.raises(InputError, match="concat got no tables"):
         Positions.concat([])
 

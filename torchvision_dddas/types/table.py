@@ -1,6 +1,6 @@
 """Tables: records with columns of one length; and boxes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -39,11 +39,12 @@ class Table(Record):
         return replace(self, **{name: column[rows] for name, column in columns_of(self).items()})  # type: ignore[type-var]
 
     @classmethod
-    def concat(cls, tables: Sequence[Self]) -> Self:
+    def concat(cls, tables: Iterable[Self]) -> Self:
         """Join tables. Fields that are not arrays come from the first table, but frames and times become arrays.
 
-        Raise InputError without tables, and for tables whose columns or their meaning differ.
+        Raise InputError without tables, and for tables whose columns, their meaning or their kind differ.
         """
+        tables = list(tables)
         if not tables:
             raise InputError(f"{cls.__name__}.concat got no tables; wanted at least one")
         columns = [columns_of(table) | _common_columns(table) for table in tables]
@@ -52,6 +53,12 @@ class Table(Record):
             wrong += [name for name in _MEANING if getattr(table, name, None) != getattr(tables[0], name, None)]
             if wrong:
                 raise InputError(f"tables of {cls.__name__} that are joined must have the same {', '.join(wrong)}")
+        kinds = [kind for table in tables if isinstance(kind := getattr(table, "kind", None), str)]
+        if len(set(kinds)) > 1:
+            raise InputError(
+                f"tables of {cls.__name__} that are joined must have the same kind, got "
+                f"{' and '.join(dict.fromkeys(kinds))}; dataclasses.replace(table, kind=...) changes it"
+            )
         joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
