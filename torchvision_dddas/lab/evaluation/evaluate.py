@@ -1,6 +1,7 @@
 """Compare results with the truth, for one clip or many: each clip, pooled over the counts, and the mean over clips."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from pathlib import Path
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import is_mot_text, read_detections
+from torchvision_dddas.io.detection_tables import is_mot_text
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.lab.evaluation.metrics import boxes, pixels, tracking
 from torchvision_dddas.lab.evaluation.metrics.matching import LEAST
@@ -26,11 +27,12 @@ from torchvision_dddas.lab.evaluation.metrics.truth import (
     find_truth,
     labels_of,
     load_truth,
+    read_boxes,
     read_rows,
 )
 from torchvision_dddas.memory import MASK
 
-DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
+DETECTIONS, TRACKS = ("detections.txt", "detections.csv"), ("tracks.txt", "tracks.csv")
 _ENDINGS = (".txt", ".csv", ".json", ".xml", ".parquet")
 # True boxes of a median size below _SMALL_PX are matched at an IoU of _LOOSE too, to see how many only fit badly.
 _SMALL_PX, _LOOSE, _MANY = 16, 0.2, 0.1
@@ -97,7 +99,7 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
     if not pairs:
         raise InputError(
             f"no clip to score: no folder in {truth} that holds masks, boxes or tracks has a counterpart in {result} "
-            f"with a {DETECTIONS} or {TRACKS}"
+            f"with a {' or '.join(DETECTIONS + TRACKS)}"
         )
     notes += [f"{n}: no result, not scored" for n in names if n not in places]
     notes += [f"{n}: no truth, not scored" for n in places if n not in pairs]
@@ -106,7 +108,7 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
 
 def _is_result(place: Path) -> bool:
     """Return whether a place looks like a result: a file, or a folder that dddas detect or dddas track wrote."""
-    return place.is_file() or any((place / name).is_file() for name in (DETECTIONS, TRACKS))
+    return place.is_file() or any((place / name).is_file() for name in DETECTIONS + TRACKS)
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,7 @@ class Result:
 
 def load_result(place: Path) -> Result:
     """Read a result folder, or a file or folder that `read_detections` reads. Raise InputError if it is neither."""
+    rows: MotRows | None
     if place.is_file() or (not _is_result(place) and any(any(place.glob(f"*.{end}")) for end in ("txt", "png"))):
         rows, notes = _read_boxes(place)
         if not rows.named:
@@ -160,14 +163,16 @@ def load_result(place: Path) -> Result:
         return Result(place, 0, None, False, "complete", rows.table, notes=notes)
     if not _is_result(place):
         raise InputError(
-            f"{place} is not a result of dddas detect or dddas track: it holds neither {DETECTIONS} nor {TRACKS}"
+            f"{place} is not a result of dddas detect or dddas track: it holds neither {DETECTIONS[0]} nor "
+            f"{TRACKS[0]}, nor one of them as .csv"
         )
     detected = tracks = None
-    if (place / DETECTIONS).is_file():
-        detected = read_rows(place / DETECTIONS, "detections").table.boxes_by_frame()
-    if (place / TRACKS).is_file():
-        rows = read_rows(place / TRACKS, "tracks")
-        check_identities(rows.table, rows.line, place / TRACKS)
+    _, rows, said = _read_first(place, DETECTIONS)
+    if rows is not None:
+        detected = rows.table.boxes_by_frame()
+    path, rows, more = _read_first(place, TRACKS)
+    if rows is not None:
+        check_identities(rows.table, rows.line, path)
         tracks = rows.table
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
@@ -180,18 +185,22 @@ def load_result(place: Path) -> Result:
         # Tables of other programs do not state the length of the clip. If there are masks, there is one for each frame.
         numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
         frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []
-    return Result(place, frames, detected, "masks" in outputs, state, tracks)
+    return Result(place, frames, detected, "masks" in outputs, state, tracks, notes=(*said, *more))
+
+
+def _read_first(folder: Path, names: Sequence[str]) -> tuple[Path, MotRows | None, tuple[str, ...]]:
+    """Return the place, the boxes and the notes of the first table that a folder holds; no boxes if it holds none."""
+    place = next((folder / name for name in names if (folder / name).is_file()), folder)
+    if place.suffix == ".txt":
+        return place, read_rows(place, place.stem), ()
+    return (place, None, ()) if place == folder else (place, *read_boxes(place))
 
 
 def _read_boxes(place: Path) -> tuple[MotRows, tuple[str, ...]]:
     """The boxes of a result in any format that dddas convert reads, and notes. Raises InputError."""
     if is_mot_text(place):
         return read_rows(place, "result"), ()
-    table = read_detections(place)
-    table = table[~table.of_kind("untracked")]
-    identity = np.full(len(table), -1) if table.identity is None else table.identity
-    rows = MotRows(TrackTable(table.frame, identity, table.box_px), np.ones(len(table)), table.line)
-    return rows, table.notes
+    return read_boxes(place)
 
 
 @dataclass(frozen=True)
@@ -217,6 +226,7 @@ def score_clip(
     InputError if truth and result share no frame, or if the result lacks data that the truth needs.
     """
     frames: list[int] = []
+    notes += [f"the truth of {result.name}: {note}" for note in truth.notes]
     notes += [f"{result.name}: {note}" for note in result.notes]
     of_frames: dict[str, list[Any]] = {}
     has_tracks = truth.tracks is not None and result.tracks is not None

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.detection_tables import read_detections
+from torchvision_dddas.io.track_files import write_tracks
 from torchvision_dddas.lab.evaluation.evaluate import evaluate
 
 NOTHING = np.zeros((30, 40), np.uint8)
@@ -130,8 +132,8 @@ DETECTED = "1,-1,0,0,10,20,0.9,-1,-1,-1\n"
 
 def clip(tmp_path, truth=TRUTH, **files) -> tuple[Path, Path]:
     """The places of a truth file and of a result folder with these files, a __ for each dot."""
+    (tmp_path / "out").mkdir(parents=True, exist_ok=True)
     (tmp_path / "gt.txt").write_text(truth)
-    (tmp_path / "out").mkdir(exist_ok=True)
     for name, text in files.items():
         (tmp_path / "out" / name.replace("__", ".")).write_text(text)
     return tmp_path / "gt.txt", tmp_path / "out"
@@ -229,6 +231,37 @@ def test_masks_do_not_score_tracks_and_a_note_says_so(tmp_path):
     report = evaluate(tmp_path / "truth", out)
     assert (report["clips"]["out"]["pixels"]["f"], report["clips"]["out"]["boxes"]["f1"]) == (1, 1)
     assert report["notes"] == ["out: tracks are not scored, because masks hold no identities"]
+
+
+def test_a_folder_with_the_csv_of_a_run_alone_is_a_result(tmp_path):
+    header, found = "frame,identity,x_px,y_px,width_px,height_px\n", FOUND.replace(",1,-1,-1,-1\n", "\n")
+    for name in "ab":
+        clip(tmp_path / "gt" / name), (tmp_path / "ours" / name).mkdir(parents=True)
+        (tmp_path / "ours" / name / "tracks.csv").write_text(header + found)
+    (tmp_path / "ours" / "b" / "detections.csv").write_text(header + found)
+    scored = evaluate(tmp_path / "gt", tmp_path / "ours")["clips"]
+    assert [clip["tracks"]["n_tp"] for clip in scored.values()] == [3, 3]
+    assert scored["b"]["boxes"]["n_hit"] == 3
+
+
+@pytest.mark.parametrize("name", ["gt.json", "gt.xml", "gt.csv"])
+def test_true_boxes_in_other_formats_score_as_text_does(tmp_path, name):
+    text, out = clip(tmp_path, TRUTH[: TRUTH.rindex("2,2")], tracks__txt=FOUND, detections__txt=DETECTED)
+    write_tracks(read_detections(text), tmp_path / name, size=(200, 40))
+    wanted, found = (evaluate(truth, out)["clips"]["out"] for truth in (text, tmp_path / name))
+    assert found == wanted and found["tracks"]["n_tp"] == 3
+
+
+def test_true_boxes_of_results_name_their_assumptions_and_an_empty_file_is_refused(tmp_path):
+    _, out = clip(tmp_path, detections__txt=DETECTED)
+    for boxes in ([], [{"image_id": 1, "bbox": [0, 0, 10, 20]}]):
+        (tmp_path / "gt.json").write_text(json.dumps(boxes))
+        if not boxes:
+            with pytest.raises(InputError, match=r"gt\.json holds no boxes; wanted the true boxes"):
+                evaluate(tmp_path / "gt.json", out)
+    report = evaluate(tmp_path / "gt.json", out)
+    assert report["clips"]["out"]["boxes"]["n_hit"] == 1
+    assert report["notes"][0].startswith("the truth of out: the file lists no images")
 
 
 def test_tracks_of_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_counts(tmp_path):

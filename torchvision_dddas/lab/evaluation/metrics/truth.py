@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.images import read_mask as read_mask
 from torchvision_dddas.io.tables import LAST_FRAME, check_crowding
 from torchvision_dddas.lab.evaluation.metrics.text_rows import FARTHEST, read_columns, read_text
@@ -91,7 +92,7 @@ class ClipTruth:
     frames of the clip, 0 if unknown. labels: meaning of the masks' values. positions: None if unknown. fleet: positions
     of the landmarks, with their own identities. `matching.counted` uses ignoring, others and regions. ignoring: the
     treatment of a found box on an ignored box. others: boxes that are neither true nor ignored but may match a found
-    box. regions: unlabelled regions, whose identities have no meaning.
+    box. regions: unlabelled regions, whose identities have no meaning. notes: how a file was read.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -107,6 +108,7 @@ class ClipTruth:
     ignoring: Ignoring = "dropped"
     others: TrackTable | None = None
     regions: TrackTable | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def frames(self) -> list[int]:
@@ -166,9 +168,13 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 
 def _load_boxes(path: Path) -> ClipTruth:
+    if path.suffix.lower() in (".json", ".xml", ".parquet"):
+        return _load_table(path)
     lines = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     if not lines:
         raise InputError(f"{path} is empty: wanted one box a line")
+    if path.suffix.lower() == ".csv" and lines[0][:1] != ["nan"] and "".join(lines[0])[:1].isalpha():
+        return _load_table(path)
     if len(lines[0]) == 4:
         try:
             boxes_px = np.array([[float(v) for v in row] for row in lines])
@@ -200,6 +206,17 @@ def _load_boxes(path: Path) -> ClipTruth:
     return ClipTruth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
 
 
+def _load_table(path: Path) -> ClipTruth:
+    """Read the true boxes of a file in another format, such as COCO or CVAT. Raise InputError as `read_boxes` does."""
+    rows, notes = read_boxes(path)
+    if not len(rows.line):
+        raise InputError(f"{path} holds no boxes; wanted the true boxes of a clip")
+    if rows.named:
+        check_identities(rows.table, rows.line, path)
+    boxes = rows.table.boxes_by_frame()
+    return ClipTruth("boxes", path, {}, boxes, rows.table if rows.named else None, notes=notes)
+
+
 _COLUMNS = ("frame", "identity", "x", "y", "width", "height", "counts")
 
 
@@ -226,6 +243,14 @@ def read_rows(path: Path, what: str) -> MotRows:
     boxes = TrackTable.of(rows["frame"], rows["identity"], rows.stack(*_COLUMNS[2:6]))
     check_sizes(boxes.box_px, rows.line, f"{what} {path}")
     return MotRows(boxes, rows["counts"], rows.line)
+
+
+def read_boxes(path: Path) -> tuple[MotRows, tuple[str, ...]]:
+    """Return the boxes of a file in any format that `read_detections` reads, and notes. Raise InputError as it does."""
+    table = read_detections(path)
+    table = table[~table.of_kind("untracked")]
+    identity = np.full(len(table), -1) if table.identity is None else table.identity
+    return MotRows(TrackTable(table.frame, identity, table.box_px), np.ones(len(table)), table.line), table.notes
 
 
 def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
