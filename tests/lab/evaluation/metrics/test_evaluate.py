@@ -293,7 +293,11 @@ def test_tracks_of_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_
         (TRUTH, "1,7,0,0,-10,20,1\n", r"line 1: the box is -10×20 pixels; wanted more than 0"),
         (TRUTH, "1,7,0,0\n", r"line 1: 4 columns; wanted frame,identity,x,y,width,height"),
         (TRUTH, "frame,id,x,y,w,h\n", r"line 1: frame is 'frame'"),
-        (TRUTH, rows([1], -1) + rows([1], 3), r"line 1: identity -1 means none, but other rows have one"),
+        (
+            TRUTH,
+            rows([1], -1) + rows([1], 3),
+            r"line 1 has no identity \(-1 or nothing\), but other lines have an identity",
+        ),
         (TRUTH, rows([101], 7), r"share no frame: truth 1 to 2, result 101 to 101"),
         (TRUTH + rows([2]), FOUND, r"gt\.txt, lines 3 and 5: identity 1 twice in frame 2"),
         (TRUTH + rows([2], "x"), FOUND, r"truth .*gt\.txt, line 5: identity is 'x'"),
@@ -303,6 +307,20 @@ def test_tracks_of_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_
 def test_a_mistake_in_a_table_is_one_line_with_file_and_line(tmp_path, truth, found, line):
     with pytest.raises(InputError, match=line):
         evaluate(*clip(tmp_path, truth, tracks__txt=found))
+
+
+def test_a_box_without_identity_among_others_is_named_in_each_format(tmp_path):
+    truth, _ = clip(tmp_path)
+    (tmp_path / "a.csv").write_text("frame,identity,x_px,y_px,width_px,height_px\n1,7,0,0,10,20\n1,,50,0,10,20\n")
+    with pytest.raises(InputError, match=r"a\.csv, line 3 has no identity \(-1 or nothing\), but other lines have"):
+        evaluate(truth, tmp_path / "a.csv")
+    boxes = [{"image_id": 1, "bbox": [50 * k, 0, 9, 9], **({"track_id": 7} if k else {})} for k in range(3)]
+    (tmp_path / "a.json").write_text(json.dumps(boxes))
+    with pytest.raises(InputError, match=r"a\.json, box 1 has no identity \(-1 or nothing\), but other boxes have"):
+        evaluate(truth, tmp_path / "a.json")
+    (tmp_path / "a.json").write_text(json.dumps(boxes[1:]))
+    with pytest.raises(InputError, match=r"a\.json, boxes 1 and 2: identity 7 twice in frame 1"):
+        evaluate(truth, tmp_path / "a.json")
 
 
 def test_truth_without_the_asked_frames_or_a_length_is_refused(tmp_path):

@@ -264,18 +264,21 @@ def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
 def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
     """Raise InputError with file and lines unless each row has its own identity in its frame.
 
-    line: (N,) line in the file.
+    line: (N,) line in the file, or the number of the box in a file that is not a table.
     """
+    is_text = path.is_file() and path.suffix.lower() not in (".json", ".xml")
+    unit, units = ("line", "lines") if is_text else ("box", "boxes")
     unnamed = np.flatnonzero(table.identity == -1)
     if len(unnamed):
-        raise InputError(f"{path}, line {line[unnamed[0]]}: identity -1 means none, but other rows have one")
+        first = f"{path}, {unit} {line[unnamed[0]]}"
+        raise InputError(f"{first} has no identity (-1 or nothing), but other {units} have an identity")
     order = np.lexsort([line, table.identity, table.frame])
     frame, identity, line = table.frame[order], table.identity[order], line[order]
     again = np.flatnonzero((frame[1:] == frame[:-1]) & (identity[1:] == identity[:-1]))
     if len(again):
         k = again[0]
         raise InputError(
-            f"{path}, lines {line[k]} and {line[k + 1]}: identity {identity[k]} twice in frame {frame[k]}; "
+            f"{path}, {units} {line[k]} and {line[k + 1]}: identity {identity[k]} twice in frame {frame[k]}; "
             "an identity has one box a frame"
         )
 
