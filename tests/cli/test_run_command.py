@@ -284,7 +284,10 @@ def test_a_network_gives_classes_to_places_and_zones_and_what_moves_is_kept(ddda
     ("words", "says"),
     [
         (["--detections", "{boxes}", "--ignore", "mask.png"], "--ignore is for the search"),
-        (["--detections", "{boxes}", "--live"], "--detections is of no use with --live"),
+        (
+            ["--detections", "{boxes}", "--live"],
+            "--detections is of no use with --live: a live run cannot take a table",
+        ),
         (["--box-format", "xyxy"], "--box-format is for --detections FILE"),
         (["--provider", "cuda"], "--provider is for --detector MODEL"),
         (["--movers"], "--movers is for --detector or --detections"),

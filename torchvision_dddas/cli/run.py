@@ -195,7 +195,8 @@ def run(
     limits = {"--allow-commands": allow_commands or None, "--geofence": geofence, "--altitude-band": altitude_band}
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
-        others["--detections"] = detections
+        why = "is of no use with --live: a live run cannot take a table of boxes; give a network with --detector"
+        refuse_options({"--detections": detections}, why)
         refuse_options(others, "is of no use with --live, which draws and simulates nothing")
         if command is None:
             refuse_options(limits, "is for --command mavlink:...; give it too")
