@@ -91,6 +91,7 @@ def test_half_precision_and_free_sizes_find_the_same(picture, tmp_path):
 
 def test_names_are_of_the_file_or_given(picture, tmp_path):
     model = write_finder(tmp_path / "model.onnx", "YOLOv8", metadata=NAMES)
+    assert OnnxDetector.delay_frames == 0
     assert OnnxDetector(model)(picture).label.tolist() == ["person"] and not OnnxDetector(model).notes
     (tmp_path / "classes.txt").write_text("lorry\nwalker\ncoach\n")
     assert OnnxDetector(model, classes=tmp_path / "classes.txt")(picture).label.tolist() == ["walker"]

@@ -28,8 +28,10 @@ class OnnxDetector:
     ...     print(result.tracks.label)
 
     layout: layout of its outputs. size_px: (width, height) of its input. names: the classes by number. notes:
-    assumptions, such as classes without names.
+    assumptions, such as classes without names. delay_frames: frames between a picture and its result, always 0.
     """
+
+    delay_frames = 0
 
     def __init__(
         self,
