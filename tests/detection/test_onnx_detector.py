@@ -93,8 +93,10 @@ def test_names_are_of_the_file_or_given(picture, tmp_path):
     model = write_finder(tmp_path / "model.onnx", "YOLOv8", metadata=NAMES)
     assert OnnxDetector.delay_frames == 0
     assert OnnxDetector(model)(picture).label.tolist() == ["person"] and not OnnxDetector(model).notes
-    (tmp_path / "classes.txt").write_text("lorry\nwalker\ncoach\n")
-    assert OnnxDetector(model, classes=tmp_path / "classes.txt")(picture).label.tolist() == ["walker"]
+    for encoding in ("utf-8", "utf-8-sig"):  # some editors begin a file with a byte order mark
+        (tmp_path / "classes.txt").write_text("lorry\nwalker\ncoach\n", encoding)
+        detect = OnnxDetector(model, classes=tmp_path / "classes.txt")
+        assert detect(picture).label.tolist() == ["walker"] and detect.names[0] == "lorry"
     with pytest.raises(InputError, match="has 3 classes, and 2 names"):
         OnnxDetector(model, classes=["a", "b"])
 

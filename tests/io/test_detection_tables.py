@@ -396,5 +396,7 @@ def test_a_table_of_another_clip_or_interval_is_refused():
 def test_the_classes_of_a_folder_of_labels_have_the_names_of_classes_txt(tmp_path):
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels" / "a_1.txt").write_text("0 0.5 0.5 0.1 0.1\n7 0.2 0.2 0.1 0.1\n")
-    (tmp_path / "classes.txt").write_text("person\ncar\n")
-    assert read_detections(tmp_path / "labels", size=(640, 480)).classes(slice(None))[0].tolist() == ["person", "7"]
+    for encoding in ("utf-8", "utf-8-sig"):  # some editors begin a file with a byte order mark
+        (tmp_path / "classes.txt").write_text("person\ncar\n", encoding)
+        read = read_detections(tmp_path / "labels", size=(640, 480))
+        assert read.classes(slice(None))[0].tolist() == ["person", "7"]

@@ -210,7 +210,7 @@ def _read_names(given: Sequence[str] | str | Path) -> dict[int, str]:
     if not isinstance(given, str | Path):
         return dict(enumerate(map(str, given)))
     try:
-        names = Path(given).read_text("utf-8").splitlines()
+        names = Path(given).read_text("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"the classes {given} cannot be read: {getattr(error, 'strerror', error)}") from None
     if not any(names):

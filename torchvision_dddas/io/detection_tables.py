@@ -274,7 +274,7 @@ def _class_names(folder: Path) -> dict[int, str]:
     """Return the names of classes by number, from the lines of classes.txt in a folder of labels or above it."""
     for file in (folder / "classes.txt", folder.parent / "classes.txt"):
         if file.is_file():
-            return dict(enumerate(file.read_text("utf-8", "replace").splitlines()))
+            return dict(enumerate(file.read_text("utf-8-sig", "replace").splitlines()))
     return {}
 
 
