@@ -186,12 +186,13 @@ def test_results_in_each_format_that_convert_writes_score_as_text_does(dddas, fi
     out = tmp_path / "as" / out
     out.parent.mkdir()
     assert dddas("convert", text, out, *more).exit_code == 0
-    out, folders = out / "masks" if more else out, (tmp_path / "by_text", tmp_path / "by_other")
-    for place, folder in zip((text, out), folders, strict=True):
+    places = [text, out, *([out / "masks"] if more else [])]
+    folders = [tmp_path / f"by_{k}" for k in range(len(places))]
+    for place, folder in zip(places, folders, strict=True):
         done = dddas("evaluate", truth, place, "--out", folder)
         assert done.exit_code == 0, done.output
-    one, other = (next(iter(measures(folder)["clips"].values())) for folder in folders)
-    assert other == one and one["tracks"]["n_tp"] == 2
+    one, *others = (next(iter(measures(folder)["clips"].values())) for folder in folders)
+    assert all(other == one for other in others) and one["tracks"]["n_tp"] == 2
 
 
 def test_the_csv_of_a_run_is_scored_without_its_detections_that_have_no_identity(dddas, file, tmp_path):

@@ -108,6 +108,17 @@ def test_files_of_other_boxes_are_not_left_beside_new_ones(to, file, tmp_path):
         write_tracks(tracks(frames=(1, 2)), tmp_path, to=to, size=SIZE)
 
 
+def test_masks_are_read_from_the_folder_that_was_written(tmp_path):
+    write_tracks(tracks(), tmp_path / "out", to="davis", size=SIZE)
+    read, masks = read_detections(tmp_path / "out"), read_detections(tmp_path / "out" / "masks")
+    assert (
+        len(read) > 0 and read.box_px.tolist() == masks.box_px.tolist() and read.frame.tolist() == masks.frame.tolist()
+    )
+    (tmp_path / "none" / "masks").mkdir(parents=True)
+    with pytest.raises(InputError, match="holds no labels"):
+        read_detections(tmp_path / "none")
+
+
 def test_a_table_without_tracks_becomes_empty_masks(tmp_path):
     (tmp_path / "a.csv").write_text("frame,identity,x_px,y_px,width_px,height_px\n")
     write_tracks(read_detections(tmp_path / "a.csv"), tmp_path, to="davis", size=SIZE, pictures=["a.png"])

@@ -47,7 +47,11 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
     said: list[str] = []
     if os.path.isdir(path):  # noqa: PTH112 (pathlib raises for a name that no file can have)
         files = sorted(path.glob("*.png"), key=lambda file: natural_order(file.name))
-        if not files or any(file.suffix == ".txt" for file in path.iterdir()):
+        if any(file.suffix == ".txt" for file in path.iterdir()):
+            return None
+        if not files and (masks := path / "masks").is_dir():  # `write_tracks` writes DAVIS masks into this folder
+            return read_foreign(masks, pictures)
+        if not files:
             return None
         text, notes = _cells(path, _read_masks(files, pictures, said))
         return text, notes + said

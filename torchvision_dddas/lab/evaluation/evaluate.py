@@ -34,6 +34,7 @@ from torchvision_dddas.memory import MASK
 
 DETECTIONS, TRACKS = ("detections.txt", "detections.csv"), ("tracks.txt", "tracks.csv")
 _ENDINGS = (".txt", ".csv", ".json", ".xml", ".parquet")
+_LABELS = ("*.txt", "*.png", "masks/*.png")  # files of YOLO's labels and DAVIS masks
 # True boxes of a median size below _SMALL_PX are matched at an IoU of _LOOSE too, to see how many only fit badly.
 _SMALL_PX, _LOOSE, _MANY = 16, 0.2, 0.1
 
@@ -155,7 +156,7 @@ class Result:
 def load_result(place: Path) -> Result:
     """Read a result folder, or a file or folder that `read_detections` reads. Raise InputError if it is neither."""
     rows: MotRows | None
-    if place.is_file() or (not _is_result(place) and any(any(place.glob(f"*.{end}")) for end in ("txt", "png"))):
+    if place.is_file() or (not _is_result(place) and any(any(place.glob(end)) for end in _LABELS)):
         rows, notes = _read_boxes(place)
         if not rows.named:
             return Result(place, 0, rows.table.boxes_by_frame(), False, "complete", notes=notes)
