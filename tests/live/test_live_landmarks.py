@@ -140,3 +140,20 @@ def test_damaged_reports_and_landmarks_that_join_later_are_events_and_left_out(o
     assert "gives no place of a landmark" in said[0] and "new was not there at the start" in said[2]
     assert "off the globe" in said[3]
     assert marks.record(now_s, 10.0).names == ("a",)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b'{"a":' * 10_000,
+        b'{"landmark":"a","east_m":1' + b"0" * 400 + b',"north_m":0}',
+        b"landmark,east_m,north_m\rb,1,2",
+    ],
+)
+def test_reports_follow_a_damaged_one(opened, damaged: bytes):
+    marks, script, health = opened()
+    now_s = time.time()
+    script.reports += [(now_s, damaged), (now_s, report("a", now_s, 1.0))]
+    marks.wait(None)
+    assert marks.record(now_s, 10.0).names == ("a",)
+    assert texts(health)[0].endswith("gives no place of a landmark: such reports are left out")

@@ -105,14 +105,14 @@ class LiveLandmarks:
             for came_s, content in self._source.receive():
                 try:
                     fault = self._add(came_s, content)
-                except (ValueError, TypeError, KeyError, IndexError, struct.error):
+                except Exception:  # no damaged report ends the thread
                     fault = f"{content[:40]!r} gives no place of a landmark"
                 if fault and fault not in self._told and len(self._told) < _KEPT:
                     self._told.add(fault)
                     self._health.event("landmarks", f"{self.name}: {fault}: such reports are left out")
 
     def _add(self, came_s: float, content: bytes) -> str:
-        """Add a report. Return "", or why it is left out. Raise ValueError and the like for a damaged one."""
+        """Add a report. Return "", or why it is left out. Raise any exception for a damaged one."""
         kind = kind_of_report(content)
         if kind == "mavlink":
             number, system, payload = message_parts(content)
