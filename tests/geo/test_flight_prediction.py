@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import AerialParameters
+from torchvision_dddas.geo import flight_prediction
 from torchvision_dddas.geo.flight_prediction import predict_flight
 from torchvision_dddas.types import Flight, Telemetry
 
@@ -91,3 +92,14 @@ def test_slow_reports_are_continued_for_longer(rate_hz, reach_s):
 def test_a_young_flight_has_the_growth_of_an_unknown_one():
     made = predict_flight(flight(0.5), AERIAL)
     assert at(made, 1.5).position_sigma_m == pytest.approx(np.hypot(AERIAL.position_sigma_m, 2.0), rel=0.02)
+
+
+def test_a_flood_of_reports_predicts_the_same_from_a_few_hundred_of_them(monkeypatch):
+    shapes, whole = [], flight_prediction.np.linalg.norm
+    monkeypatch.setattr(flight_prediction.np.linalg, "norm", lambda a, **k: shapes.append(len(a)) or whole(a, **k))
+    made, few = predict_flight(flight(30.0, 10.0, rate_hz=1000.0), AERIAL), predict_flight(flight(30.0, 10.0), AERIAL)
+    assert max(shapes) < 1000
+    for ahead_s in (0.5, 2.0):
+        found, wanted = at(made, 30 + ahead_s), at(few, 30 + ahead_s)
+        np.testing.assert_allclose(found.place, wanted.place, atol=0.05)
+        assert found.position_sigma_m == pytest.approx(wanted.position_sigma_m, rel=0.05)
