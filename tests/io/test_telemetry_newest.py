@@ -147,3 +147,43 @@ def test_the_first_autopilot_is_taken_and_messages_of_other_systems_are_left_out
     assert say(7, dialect.MAVLink_system_time_message(1_000_000, 0)) == "" == say(9, vehicle)
     log = window.read()
     assert log.place[-1] == pytest.approx((11.5, 7)) and log.time_s[-1] == pytest.approx(NOW_S, abs=1)
+
+
+def objects(count: int = 20) -> list[bytes]:
+    """Reports as JSON, ten a second."""
+    return [line(NOW_S - 2 + k / 10, 48 + k * 1e-5) for k in range(count)]
+
+
+def line(time_s: float, latitude_deg: float, **more: Any) -> bytes:
+    row = {"time_s": time_s, "longitude_deg": 11.5, "latitude_deg": latitude_deg, "altitude_m": 50}
+    return json.dumps(row | more).encode()
+
+
+def test_datagrams_that_came_in_another_order_are_read_by_their_times(window):
+    lines = objects()
+    lines[10], lines[13] = lines[13], lines[10]
+    fill(window, lines)
+    log = window.read()
+    assert log is not None and len(log) == 20
+    assert (np.diff(log.time_s) > 0).all() and (np.diff(log.place[:, 1]) > 0).all()
+
+
+def test_times_of_different_clocks_are_not_mixed(window):
+    fill(window, [*objects(), line(NOW_S + 1e6, 48.0), line(NOW_S, 48.1)])
+    with pytest.raises(InputError, match="runs back"):
+        window.read()
+
+
+def test_a_report_that_cannot_be_written_is_forgotten_as_other_damage(window):
+    fill(window, [b'{"time_s": 1, "odd": "\\ud800"}', *objects()])
+    with pytest.raises(UnicodeEncodeError):
+        window.read()
+    log = window.read()
+    assert log is not None and len(log) == 10
+
+
+def test_names_beyond_a_limit_are_not_read(window):
+    fill(window, [line(NOW_S - 2 + k / 10, 48.0, **{f"odd{k}x{j}": 1 for j in range(200)}) for k in range(20)])
+    log = window.read()
+    assert log is not None and len(log) == 20
+    assert window._content().partition(b"\r\n")[0].count(b",") < 500

@@ -11,6 +11,7 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from torchvision_dddas.io.telemetry.tables import read_telemetry_table
 from torchvision_dddas.types import Telemetry
 
 _WINDOW_S, _MOST, _LEAST = 8.0, 600, 12
+_SWAPPED_S = 5.0  # reports that come in another order than they were made differ by this time at most
+_NAMES_MOST = 500  # columns that are read of JSON
 # gpsd's TPV reports, whose names are ambiguous elsewhere; its estimates of errors have no stated probability.
 _GPSD = {"time": "time", "lat": "latitude_deg", "lon": "longitude_deg", "speed": "speed_m_s", "altMSL": "above_sea_m"}
 _GPSD |= {"altHAE": "above_ellipsoid_m"}
@@ -111,7 +114,8 @@ class ReportWindow:
     def read(self) -> Telemetry | None:
         """Return the reports, counted from 1970 by their own clock, else by their reception; None without any.
 
-        Raise InputError if they cannot be used; the older half of them is then forgotten, so that damage passes.
+        Raise InputError or any other error if they cannot be used; the older half of them is then forgotten, so that
+        damage passes.
         """
         if not self._reports:
             return None
@@ -119,9 +123,11 @@ class ReportWindow:
         try:
             path.write_bytes(self._content())
             log = self._parse(path)
-        except InputError as error:
+        except Exception as error:
             for _ in range(-(-len(self._reports) // 2)):
                 self._reports.popleft()
+            if not isinstance(error, InputError):
+                raise
             raise InputError(str(error).replace(str(path), self.name)) from None
         notes = tuple(note for note in log.notes if not any(words in note for words in PAUSES))  # usual on a link
         return replace(log, origin=f"{self.name} ({_NAMES[self.kind]})", notes=notes, **self._clock(log))
@@ -135,9 +141,9 @@ class ReportWindow:
         if self.kind == "mavlink":
             return b"".join(struct.pack(">Q", round(came_s * 1e6)) + content for came_s, content in self._reports)
         if self.kind == "json":
-            rows = [json.loads(content) for content in contents]
-            text = io.StringIO()
-            table = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), restval="")
+            rows = _in_order([json.loads(content) for content in contents])
+            text, names = io.StringIO(), dict.fromkeys(name for row in rows for name in row)
+            table = csv.DictWriter(text, list(names)[:_NAMES_MOST], restval="", extrasaction="ignore")
             table.writeheader()
             table.writerows(rows)
             return text.getvalue().encode()
@@ -161,6 +167,17 @@ class ReportWindow:
             start_utc_s = 0.0 if is_clock(log.time_s[-1]) else self.came_s - float(log.time_s[-1])
         unknown = {"start_utc_s": 0.0, "start_local_s": math.nan, "latest_utc_s": math.nan}
         return {"time_s": log.time_s + start_utc_s, **unknown}
+
+
+def _in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows by their times if some were swapped on the way. Times of different clocks are left as they came."""
+    try:
+        times = [float(row["time_s"]) for row in rows]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return rows
+    if not 0 < max((a - b for a, b in pairwise(times)), default=0.0) <= _SWAPPED_S:
+        return rows
+    return [rows[k] for k in np.argsort(times, kind="stable")]
 
 
 def _row(content: bytes) -> bytes | None:
