@@ -146,6 +146,21 @@ def test_a_vehicle_that_was_not_handed_over_is_waited_for(how, reason: str) -> N
     assert flight.ask() == ""
 
 
+def test_two_vehicles_with_the_same_number_end_commanding_by_their_clocks(flight: Flight) -> None:
+    other = Flight()
+    other.safety, other.now_s, flight.time_ms = flight.safety, flight.now_s, 600_000
+    flight.place()
+    other.place(east=5.0)
+    assert flight.safety.ended.startswith("the clock of system 1 runs back")
+
+
+def test_positions_that_were_swapped_on_the_way_end_nothing(flight: Flight) -> None:
+    flight.place()
+    flight.time_ms -= 200
+    flight.place()
+    assert flight.ask() == ""
+
+
 def test_no_vehicle_and_no_position_permit_nothing() -> None:
     flight = Flight()
     assert flight.ask() == "no vehicle is heard"

@@ -241,6 +241,16 @@ ENDINGS = {
         lambda rig: rig.wire.say(dialect.MAVLink_set_mode_message(1, 1, 6), 254, 190),
         "system 254 steers the vehicle",
     ),
+    "flown to the item of a mission": (
+        lambda rig: rig.wire.say(
+            dialect.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 2, 1, 0, 0, 0, 0, 316000000, -1109500000, 50), 255
+        ),
+        "system 255 steers the vehicle",
+    ),
+    "another home": (
+        lambda rig: rig.wire.say(command(dialect.MAV_CMD_DO_SET_HOME, 1, component=1), 255, 190),
+        "system 255 steers the vehicle",
+    ),
     "steered by another computer": (
         lambda rig: rig.wire.say(command(dialect.MAV_CMD_DO_REPOSITION, component=1), 1, 192),
         "system 1 steers the vehicle",
@@ -254,6 +264,15 @@ ENDINGS = {
         "two vehicles, 1 and 2, are heard; give ?system=N",
     ),
 }
+
+
+def test_a_report_without_a_place_does_not_change_the_height_above_the_sea() -> None:
+    rig = Rig()
+    rig.fly(1.0)
+    rig.wire.say(position((0.0, 0.0), 0.0, round(1000 * rig.now_s) + 1, 0.0))  # a receiver that lost its fix
+    assert (rig.commands.uav.sea_m, rig.commands.uav.safety.altitude_m) == (GROUND_M + UP_M, UP_M)
+    rig.fly(8.0)
+    assert {round(m.z) for m in rig.taken(dialect.MAV_CMD_DO_REPOSITION)} == {round(GROUND_M + UP_M)}
 
 
 @pytest.mark.parametrize("name", ENDINGS)

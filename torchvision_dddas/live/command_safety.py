@@ -135,12 +135,19 @@ class CommandSafety:
 
     def hear_position(
         self, now_s: float, system: int, time_ms: int, place_deg: tuple[float, float], altitude_m: float
-    ) -> None:
-        """Take a position. time_ms: the vehicle's clock; a repeated report with the same time is no news."""
+    ) -> bool:
+        """Take a position. Return whether it is news: a repeated report with the same time is not.
+
+        time_ms: the vehicle's clock. A clock that runs back belongs to another vehicle, or to one that restarted.
+        """
         self.check(now_s)
         is_known = all(map(math.isfinite, (*place_deg, altitude_m))) and any(place_deg) and abs(place_deg[1]) <= 90
-        if system == self.system and system and is_known and time_ms != self._time_ms:
-            self.place_deg, self.altitude_m, self._placed_s, self._time_ms = place_deg, altitude_m, now_s, time_ms
+        if system != self.system or not system or not is_known or time_ms == self._time_ms:
+            return False
+        if self._mode is not None and time_ms < self._time_ms - 1000 * POSITION_S:
+            self.end(f"the clock of system {system} runs back: two vehicles have this number, or it restarted")
+        self.place_deg, self.altitude_m, self._placed_s, self._time_ms = place_deg, altitude_m, now_s, time_ms
+        return True
 
     def hear_station(self, now_s: float, system: int, steers: bool) -> None:
         """Take a command that another system sent. steers: it moves the vehicle or its gimbal, or sets the mode."""

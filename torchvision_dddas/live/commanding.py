@@ -41,11 +41,14 @@ _TICK_S = 0.05
 _TROUBLE_S = 30.0  # for which the end of commanding is a trouble
 _NEAR = 1.0  # a command differs from the last one by at least this many metres or degrees
 _FIRST_NAV, _LAST_NAV = 16, 95  # numbers of MAV_CMD_NAV_...
-# Commands of others that steer: modes, speed, altitude, places, views, missions, arming and the gimbal.
-_STEERING = {176, 178, 186, 192, 193, 195, 196, 197, 201, 204, 205, 252, 300, 400, 1000, 1001}
+# Commands of others that steer: modes, speed, heading, altitude, home, places, views, missions, arming, the gimbal.
+_STEERING = {115, 176, 177, 178, 179, 185, 186, 189, 191, 192, 193, 195, 196, 197, 201, 204, 205, 224, 252, 300, 400}
+_STEERING |= {1000, 1001, 3000, 43000, 43001, 43002}
 _STEERING_MESSAGES = (
     *("SET_MODE", "SET_POSITION_TARGET_GLOBAL_INT", "SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET"),
     *("GIMBAL_MANAGER_SET_PITCHYAW", "GIMBAL_MANAGER_SET_ATTITUDE", "GIMBAL_MANAGER_SET_MANUAL_CONTROL"),
+    # ArduPilot flies to the item of a mission in guided mode. The band counts from home.
+    *("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_SET_CURRENT", "SET_HOME_POSITION"),
 )
 _TRACKING = {2004, 2005, 2010}
 # The mode in which the firmware follows commands of computers: ArduPilot's GUIDED, by MAV_TYPE; PX4's hold.
@@ -363,8 +366,8 @@ class LiveCommands:
             safety.hear_vehicle(now_s, system, identity, message.custom_mode, is_guided(message), armed)
         elif kind == "GLOBAL_POSITION_INT" and component == 1:
             place_deg = message.lon / 1e7, message.lat / 1e7
-            safety.hear_position(now_s, system, message.time_boot_ms, place_deg, message.relative_alt / 1e3)
-            if system == safety.system:
+            # Both heights must be of one report: their difference is the height of home.
+            if safety.hear_position(now_s, system, message.time_boot_ms, place_deg, message.relative_alt / 1e3):
                 vehicle.sea_m = message.alt / 1e3
         elif kind == "GIMBAL_MANAGER_STATUS" and system == safety.system:
             vehicle.gimbal = component, message.primary_control_sysid, message.primary_control_compid
