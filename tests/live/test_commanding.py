@@ -45,7 +45,7 @@ class Rig:
         self.wire, self.health, self.now_s, self.frame = Wire(), Health(), 500.0, 0
         self.answers, self.mode, self.place_m, self.up_m = answers, 4, np.zeros(2), UP_M
         self.pose = pose_at((0, 0), UP_M)
-        self.ground = ground or {}
+        self.ground, self.has_ended = ground or {}, False
         site = SimpleNamespace(origin_deg=HOME, landmarks=SimpleNamespace(names=tuple(self.ground)))
         locator: Any = SimpleNamespace(
             site=site,
@@ -85,7 +85,7 @@ class Rig:
         tracks = Tracks(self.frame, np.arange(1, count + 1), here.box_px, np.ones(count), np.arange(count))
         result = FrameResult(TrackedFrame(self.frame, None, Detections(), tracks), here)
         newest = Frame(self.frame, (self.frame - 1) / RATE_HZ, np.zeros((1, 1), np.uint8))
-        feed: Any = SimpleNamespace(size=CAMERA.size_px, locator=self.locator, newest=newest)
+        feed: Any = SimpleNamespace(size=CAMERA.size_px, locator=self.locator, newest=newest, ended=self.has_ended)
         return self.commands.update(result, feed)
 
     def obey(self) -> None:
@@ -264,6 +264,15 @@ ENDINGS = {
         "two vehicles, 1 and 2, are heard; give ?system=N",
     ),
 }
+
+
+def test_nothing_is_sent_for_the_last_results_of_a_run_that_stops() -> None:
+    rig = Rig()
+    rig.fly(3.0)
+    rig.show(TARGETS + 40.0)  # decided, and not sent yet
+    rig.has_ended, before = True, len(rig.obeyed)
+    rig.fly(3.0, targets=TARGETS + 40.0)
+    assert len(rig.obeyed) == before
 
 
 def test_a_report_without_a_place_does_not_change_the_height_above_the_sea() -> None:

@@ -177,6 +177,9 @@ class LiveCommands:
 
     def _decide(self, result: FrameResult, feed: Feed) -> FrameResult:
         self.component.show(result, feed.size)
+        if feed.ended:  # results of earlier pictures still come, but who stops a run wants no further command
+            self._decisions = {}
+            return result
         located, locator = result.locations, feed.locator
         if self._steering is None or located is None or locator is None or self._origin is None:
             return result
