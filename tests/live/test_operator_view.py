@@ -175,6 +175,16 @@ def decoded(part):
     return cv2.imdecode(np.frombuffer(rest[:length], np.uint8), cv2.IMREAD_COLOR)
 
 
+def test_clients_that_ask_at_the_same_time_are_no_more_than_the_limit():
+    view = begun()
+    asked = [view.pictures() for _ in range(MOST_WATCHERS + 3)]
+    assert sum(bool(next(pictures, b"")) for pictures in asked) == MOST_WATCHERS
+    asked[0].close()
+    assert not view.is_full
+    for pictures in asked:
+        pictures.close()
+
+
 def test_no_picture_is_kept_or_drawn_while_nobody_watches(monkeypatch):
     monkeypatch.setattr(operator_view, "RunPictures", None)
     view = begun()

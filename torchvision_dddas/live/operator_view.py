@@ -119,10 +119,12 @@ class OperatorView:
     def pictures(self) -> Generator[bytes]:
         """Yield the body of an endless response of type PICTURES; b"" while there is no new picture.
 
-        A slow client misses pictures, and gets the newest one next.
+        A slow client misses pictures, and gets the newest one next. The response is empty if too many clients watch.
         """
         give_way()
         with self._changed:
+            if self.is_full:  # several clients asked at the same time
+                return
             self._watchers += 1
         seen = None
         try:
