@@ -352,6 +352,11 @@ def test_an_unknown_form_is_refused_in_one_line(heard: Heard, text: str) -> None
         open_mavlink(text, heard.notify)
 
 
+def test_a_name_that_no_host_can_have_is_refused(heard: Heard) -> None:
+    with pytest.raises(InputError, match="no host can have this name"):
+        open_mavlink(f"mavlink:tcp:{'a' * 70}:5760", heard.notify)
+
+
 def test_a_port_in_use_is_refused(heard: Heard) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))

@@ -514,6 +514,12 @@ def test_a_place_that_is_no_address_is_refused_in_one_line(place, notes):
         open_stream(f"json:{place}", ABOUT, notes)
 
 
+@pytest.mark.parametrize("scheme", ["udp", "tcp"])
+def test_a_name_that_no_host_can_have_is_refused_in_one_line(scheme, notes):
+    with pytest.raises(InputError, match=rf"--emit json:{scheme}://a+:80: .*; choose another place"):
+        open_stream(f"json:{scheme}://{'a' * 70}:80", ABOUT, notes)
+
+
 def test_a_host_that_cannot_be_reached_at_the_start_is_refused(monkeypatch, notes):
     with pytest.raises(InputError, match="interface=none: no interface with this name"):
         open_stream("json:udp://239.2.3.1:5?interface=none", ABOUT, notes)

@@ -361,6 +361,10 @@ def _network(kind: str, place: str, asked: str) -> Callable[[], Port]:
     host = host.strip("[]")
     if not host or not port.isdecimal() or not 0 < int(port[:6]) <= 65535:
         raise InputError(f"{asked} lacks HOST:PORT; {WANTED}")
+    try:
+        host.encode("idna")
+    except UnicodeError as error:
+        raise InputError(f"{asked}: no host can have this name, {error}; {WANTED}") from None
     if kind == "tcp":
         return lambda: _TcpPort(host, int(port))
     return lambda: _UdpPort(host, int(port), listens=kind != "udpout")

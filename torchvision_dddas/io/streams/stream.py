@@ -228,8 +228,8 @@ def open_stream(
             outlet = open_mqtt(place, asked)
         else:
             outlet = open_connection(place, asked) if is_address else _open_lines(place, kind, asked)
-    except OSError as error:
-        raise InputError(f"{asked}: {error.strerror or error}; choose another place") from None
+    except (OSError, UnicodeError) as error:  # the latter for a name that no host can have
+        raise InputError(f"{asked}: {getattr(error, 'strerror', '') or error}; choose another place") from None
     return Stream(
         text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if is_datagram else retry_most_s
     )
