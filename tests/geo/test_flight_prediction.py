@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import AerialParameters
-from torchvision_dddas.geo import flight_prediction
 from torchvision_dddas.geo.flight_prediction import predict_flight
 from torchvision_dddas.types import Flight, Telemetry
 
@@ -95,8 +94,13 @@ def test_a_young_flight_has_the_growth_of_an_unknown_one():
 
 
 def test_a_flood_of_reports_predicts_the_same_from_a_few_hundred_of_them(monkeypatch):
-    shapes, whole = [], flight_prediction.np.linalg.norm
-    monkeypatch.setattr(flight_prediction.np.linalg, "norm", lambda a, **k: shapes.append(len(a)) or whole(a, **k))
+    shapes, whole = list[int](), np.linalg.norm
+
+    def norm(values, **more):
+        shapes.append(len(values))
+        return whole(values, **more)
+
+    monkeypatch.setattr(np.linalg, "norm", norm)
     made, few = predict_flight(flight(30.0, 10.0, rate_hz=1000.0), AERIAL), predict_flight(flight(30.0, 10.0), AERIAL)
     assert max(shapes) < 1000
     for ahead_s in (0.5, 2.0):
