@@ -1,6 +1,8 @@
 """The newest reports of a link, read by the readers of logs."""
 
 import json
+from functools import reduce
+from operator import xor
 from typing import Any
 
 import numpy as np
@@ -187,3 +189,17 @@ def test_names_beyond_a_limit_are_not_read(window):
     log = window.read()
     assert log is not None and len(log) == 20
     assert window._content().partition(b"\r\n")[0].count(b",") < 500
+
+
+@pytest.mark.parametrize("behind_s", [0.0, 3600.0, -30.0])
+def test_the_time_of_day_of_sentences_without_a_date_counts(window, behind_s):
+    lines = []
+    for k in range(20):
+        utc_s = NOW_S - 2 + k / 10 - behind_s
+        clock = f"{utc_s // 3600 % 24:02.0f}{utc_s // 60 % 60:02.0f}{utc_s % 60:05.2f}"
+        body = f"GPGGA,{clock},4800.{k:03d},N,01130.000,E,1,08,0.9,545.4,M,46.9,M,,"
+        lines.append(f"${body}*{reduce(xor, body.encode()):02X}".encode())
+    fill(window, lines)
+    log = window.read()
+    assert log is not None
+    assert log.time_s[-1] == pytest.approx(NOW_S - 0.1 - behind_s, abs=0.01)

@@ -155,7 +155,7 @@ class ReportWindow:
         if self.kind == "klv":
             return read_misb(path, None, 0.0)
         if self.kind == "nmea":
-            return read_nmea(path, path.read_text("utf-8", errors="replace"), 0.0)
+            return read_nmea(path, path.read_text("utf-8", errors="replace"), 0.0, self._reports[0][0])
         return read_telemetry_table(path, 0.0, None, self._zone, self._order)
 
     def _clock(self, log: Telemetry) -> dict[str, Any]:

@@ -32,8 +32,10 @@ SENTENCE = re.compile(rf"(?<![A-Za-z])\$?([A-Z]{{2}}(?:{'|'.join(_FIELDS)}),[^$*
 """A sentence of these kinds in any text: the part that its checksum covers, and the checksum with its star."""
 
 
-def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
+def read_nmea(path: Path, text: str, clock_offset_s: float, came_s: float = math.nan) -> Telemetry:
     """Read the sentences of `_FIELDS`. Times count from the first sentence with a time.
+
+    came_s: when the first sentence came, seconds since 1970; it gives the date if no sentence does.
 
     Heights are above the sea, and also above the ellipsoid if the sentence has the geoid's height. No sentence has a
     height above ground. Raise InputError if no whole sentence gives a place or a heading together with a time.
@@ -66,6 +68,8 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
                 continue
             for name, value in values.items():
                 log.add(name, last_s + days * _DAY_S - first_s, value, number)
+    if not clocks and math.isfinite(came_s + first_s):
+        clocks.append(first_s + _DAY_S * round((came_s - first_s) / _DAY_S))
     said = ", ".join(f"{count} {fault}" for fault, count in Counter(fault for _, fault in faults).items())
     if faults:
         log.note(f"line {min(faults)[0]}: sentences are left out: {said}")
