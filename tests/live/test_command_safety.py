@@ -52,13 +52,19 @@ class Flight:
     def __init__(self, allow: bool = True, system: int = 0) -> None:
         self.safety = CommandSafety(Limits(allow, fence(), BAND, system))
         self.now_s, self.time_ms = 1000.0, 0
+        self._ticked_s = self.now_s
 
     def beat(self, mode: int = GUIDED, guided: bool = True, armed: bool = True, system: int = 1, kind=COPTER) -> None:
         self.safety.hear_vehicle(self.now_s, system, kind, mode, guided, armed)
 
     def place(self, east: float = 0.0, north: float = 0.0, up: float = 50.0, system: int = 1) -> None:
-        self.time_ms += 100
+        self.tick()
         self.safety.hear_position(self.now_s, system, self.time_ms, at(east, north), up)
+
+    def tick(self) -> None:
+        """Move the vehicle's clock to now, at least by a tenth of a second."""
+        self.time_ms += max(100, round(1000 * (self.now_s - self._ticked_s)))
+        self._ticked_s = self.now_s
 
     def fly(self, seconds: float = 2.0) -> None:
         """Go on reporting once a second."""
@@ -214,6 +220,18 @@ def test_a_position_that_stands_still_in_time_is_stale(flight: Flight) -> None:
         flight.now_s += 0.1
         flight.beat()
         flight.safety.hear_position(flight.now_s, 1, flight.time_ms, at(0, 0), 50.0)  # the same report again
+    assert flight.safety.ended == "the position of system 1 is older than 2 s"
+
+
+def test_positions_that_come_later_and_later_end_commanding() -> None:
+    flight = Flight()
+    flight.fly()
+    assert flight.ask() == ""
+    for _ in range(30):  # the link takes half of what the vehicle sends
+        flight.now_s += 0.5
+        flight.beat()
+        flight.time_ms += 250
+        flight.safety.hear_position(flight.now_s, 1, flight.time_ms, at(0, 0), 50.0)
     assert flight.safety.ended == "the position of system 1 is older than 2 s"
 
 
@@ -401,7 +419,8 @@ def play(steps, allow: bool, given_system: int) -> Oracle:
                 oracle.is_over = True
         if what in ("place", "report"):
             place_m, up, system, is_new = how or ((0.0, 0.0), 50.0, 1, True)
-            flight.time_ms += 100 * is_new
+            if is_new:
+                flight.tick()
             flight.safety.hear_position(now_s, system, flight.time_ms, at(*place_m), up)
             if system == 1 and math.isfinite(up) and is_new:
                 oracle.place_m, oracle.up_m, oracle.placed_s = place_m, up, now_s

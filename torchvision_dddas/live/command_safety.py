@@ -104,6 +104,7 @@ class CommandSafety:
         self._mode: int | None = None  # the mode in which the vehicle was handed over
         self._stations = set[int]()
         self._other, self._heard_s, self._placed_s, self._time_ms = 0, -math.inf, -math.inf, -1
+        self._quickest_s = math.inf  # of all reports, the smallest difference of the rules' clock and the vehicle's
         self._waiting: dict[Kind, float] = {}
         self._last_s: dict[Kind, float] = {}
         self._misses, self._refusals, self._blocked = 0, Counter[Kind](), set[Kind]()
@@ -138,14 +139,21 @@ class CommandSafety:
     ) -> bool:
         """Take a position. Return whether it is news: a repeated report with the same time is not.
 
-        time_ms: the vehicle's clock. A clock that runs back belongs to another vehicle, or to one that restarted.
+        time_ms: the vehicle's clock. A clock that runs back belongs to another vehicle, or to one that restarted. A
+        report that took POSITION_S longer than the quickest report is no news either: the link is filling up.
         """
         self.check(now_s)
         is_known = all(map(math.isfinite, (*place_deg, altitude_m))) and any(place_deg) and abs(place_deg[1]) <= 90
         if system != self.system or not system or not is_known or time_ms == self._time_ms:
             return False
-        if self._mode is not None and time_ms < self._time_ms - 1000 * POSITION_S:
-            self.end(f"the clock of system {system} runs back: two vehicles have this number, or it restarted")
+        late_s = now_s - time_ms / 1000
+        if time_ms < self._time_ms - 1000 * POSITION_S:
+            self._quickest_s = late_s
+            if self._mode is not None:
+                self.end(f"the clock of system {system} runs back: two vehicles have this number, or it restarted")
+        self._quickest_s = min(self._quickest_s, late_s)
+        if late_s > self._quickest_s + POSITION_S:
+            return False
         self.place_deg, self.altitude_m, self._placed_s, self._time_ms = place_deg, altitude_m, now_s, time_ms
         return True
 
