@@ -26,7 +26,8 @@ def demo(
     kept = noting(lambda: f"the pictures up to here are kept in {out / 'clip'}", (out / "clip").exists)
     with kept, progress("filming", round(length.seconds * length.rate_hz), quiet) as tick:
         clip = film_clip(out / "clip", tick=tick)
-    lines = detect_clip(str(clip / "frames"), out, load_config(), "auto", DetectionRecorder.saved, quiet=quiet)
+    how = load_config(), "auto", DetectionRecorder.saved
+    lines = detect_clip(str(clip / "frames"), out, *how, rate_hz=length.rate_hz, quiet=quiet)
     report = score(clip / "masks", out, out)
     if not quiet:
         show(report)
