@@ -294,7 +294,10 @@ class DetectionTable(Table):
 
 
 def refuse_table(given: object) -> None:
-    """Raise InputError if detections of one frame are given as a table of a clip, or as rows selected from it."""
+    """Raise InputError if detections of one frame are given as a table of a clip, or as rows selected from it.
+
+    >>> types.refuse_table(td.Detections([[40, 60, 20, 20]]))
+    """
     if isinstance(given, DetectionTable):
         raise InputError(
             f"got a DetectionTable of {len(given)} rows; wanted the detections of one frame: give table.at(n) for "
