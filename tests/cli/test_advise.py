@@ -9,17 +9,17 @@ from tests.cli.conftest import bad
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import settings_at
 from torchvision_dddas.pipeline import Assembly
-from torchvision_dddas.pipeline.advice import Look, choose_options, describe_sizes
+from torchvision_dddas.pipeline.advice import ClipSurvey, choose_options, describe_sizes
 from torchvision_dddas.types import Flight
 
 NO_ENGINE: Any = None
 
 
-def look(rate_hz: float = 50.0, square_px: float = 20.0, count: int = 8) -> Look:
-    return Look(10, [1.5 * square_px] * count, [square_px] * count, [1.0], delay_frames=3, rate_hz=rate_hz)
+def look(rate_hz: float = 50.0, square_px: float = 20.0, count: int = 8) -> ClipSurvey:
+    return ClipSurvey(10, [1.5 * square_px] * count, [square_px] * count, [1.0], delay_frames=3, rate_hz=rate_hz)
 
 
-def choose(seen: Look, height_m: float = 0.0, live: bool = False, quick_hz: float = 30.0, **parameters: float):
+def choose(seen: ClipSurvey, height_m: float = 0.0, live: bool = False, quick_hz: float = 30.0, **parameters: float):
     settings = with_parameters(Settings(), {name.replace("__", "."): value for name, value in parameters.items()})
     distances = [settings_at(Flight(height_m), 25.0, settings)] if height_m else []
     ready = Assembly(settings, NO_ENGINE)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.pages import Page, points_inside
-from torchvision_dddas.io.report import Column, format_number, number_cell, table, text_cell
+from torchvision_dddas.io.report import ReportColumn, format_number, number_cell, table, text_cell
 from torchvision_dddas.io.report.charts import (
     MOST_POINTS,
     MOST_ROWS,
@@ -103,7 +103,7 @@ def test_a_number_is_written_for_a_reader(value, text):
 
 def test_a_table_keeps_what_it_sorts_by_to_the_last_digit_and_escapes_its_words():
     value = 0.1 + 0.2
-    columns = [Column("<clip>", text=True), Column("F", 'a "mean"')]
+    columns = [ReportColumn("<clip>", text=True), ReportColumn("F", 'a "mean"')]
     rows = [[text_cell("<i>x</i>"), number_cell(value, 3, (0.2, 0.4))], [text_cell("y"), number_cell(NAN)]]
     page = Page(table("c", columns, rows))
     assert page.values("td", "data-v") == [repr(value), ""] and "i" not in page.found

@@ -7,7 +7,7 @@ from markupsafe import Markup
 from tests.browser import evaluate, needs_browser
 from tests.lab.evaluation.report.studied import HOSTILE, study
 from torchvision_dddas.io.output.run_record import finite
-from torchvision_dddas.io.report import Column, environment, number_cell, table, text_cell
+from torchvision_dddas.io.report import ReportColumn, environment, number_cell, table, text_cell
 from torchvision_dddas.io.report.charts import Axis, Line, chart
 from torchvision_dddas.lab.evaluation.report import study_report
 from torchvision_dddas.lab.evaluation.studies.summary import summarize
@@ -58,7 +58,9 @@ def page_of(*parts):
 
 def many_rows(count):
     rows = [[text_cell(f"clip {k}"), number_cell(k / count if k else None)] for k in range(count)]
-    parts = table("many", [Column("clip", text=True), Column("F")], rows, [[text_cell("pooled"), number_cell(0.5)]])
+    parts = table(
+        "many", [ReportColumn("clip", text=True), ReportColumn("F")], rows, [[text_cell("pooled"), number_cell(0.5)]]
+    )
     svg = chart("t", Axis("x"), Axis("y"), [Line("l", np.arange(9.0), np.arange(9.0))])
     return page_of(f"<div>{parts}</div>", svg)
 

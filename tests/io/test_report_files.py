@@ -6,14 +6,14 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from torchvision_dddas.io.report import Cell, Column, Table, number_cell, render_page, text_cell
+from torchvision_dddas.io.report import Cell, ReportColumn, ReportTable, number_cell, render_page, text_cell
 from torchvision_dddas.io.report.charts import Interval, interval_chart
 from torchvision_dddas.io.report.figure_files import save_figures
 from torchvision_dddas.io.report.table_files import save_tables, to_csv, to_latex, to_markdown
 
-TABLE = Table(
+TABLE = ReportTable(
     "scores",
-    [Column("method", text=True), Column("AR₃"), Column("loss")],
+    [ReportColumn("method", text=True), ReportColumn("AR₃"), ReportColumn("loss")],
     [
         [text_cell("a|b_c & 5 %"), Cell("0.333", 1 / 3, "0.1 to 0.5", best=True), number_cell(-1.5)],
         [text_cell("x"), number_cell(None), number_cell(0.25)],

@@ -52,7 +52,7 @@ def advise(
         source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given)
         return source, assemble_files(given, telemetry, settings, source, "auto", clip)
 
-    def look(source: Source, ready: Assembly, name: str) -> advice.Look:
+    def look(source: Source, ready: Assembly, name: str) -> advice.ClipSurvey:
         with progress(f"looking with {name}", min(FRAMES, source.count or FRAMES), False) as tick:
             return advice.look_at(source, ready, FRAMES, tick)
 

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.onnx_layouts import Layout, Size, tell_layout
+from torchvision_dddas.detection.onnx_layouts import OutputLayout, Size, tell_layout
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.runtime import open_session
 from torchvision_dddas.types import Detections, Frame, as_picture
@@ -124,7 +124,7 @@ class OnnxDetector:
         width, height = (-(-round(side * ratio) // _STRIDE) * _STRIDE for side in size)
         return width, height
 
-    def _tell_layout(self, metadata: Mapping[str, str], beside: Mapping[str, Any]) -> Layout:
+    def _tell_layout(self, metadata: Mapping[str, str], beside: Mapping[str, Any]) -> OutputLayout:
         """Return the layout of the outputs by a run on a grey picture. Raise InputError as `tell_layout` does."""
         task = metadata.get("task", "detect")
         if task not in ("detect", "segment", "pose"):
@@ -165,7 +165,7 @@ class OnnxDetector:
         return {name: np.asarray(values, np.float32) for name, values in zip(self._outputs, outputs, strict=True)}
 
 
-def fit_picture(image: np.ndarray, size: Size, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fit_picture(image: np.ndarray, size: Size, layout: OutputLayout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a network's input (1, 3, H, W) for a picture, and the scale (2,) and offset (2,) from picture to input.
 
     The point (x, y) of the picture lies at scale * (x, y) + offset of the input, in pixels from the outer corner.

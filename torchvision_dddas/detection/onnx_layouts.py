@@ -42,7 +42,7 @@ Outputs = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Layout:
+class OutputLayout:
     """How a network wants its picture, and how its outputs become boxes.
 
     fit: the picture keeps its shape in the middle (centre) or at the top left (corner) of a grey input, or is stretched
@@ -60,7 +60,9 @@ class Layout:
     spread: tuple[float, ...] = (255.0, 255.0, 255.0)
 
 
-def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, softmax: bool | None = None) -> Layout:
+def tell_layout(
+    outputs: Outputs, size: Size, is_final: bool, names: int = 0, softmax: bool | None = None
+) -> OutputLayout:
     """Tell the layout from the outputs of a network for a grey picture.
 
     is_final: whether the network takes the size of the picture and gives boxes in its pixels. names: number of classes
@@ -72,12 +74,12 @@ def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, so
         _, queries, classes = shapes["logits"]
         if queries == 100 if softmax is None else softmax:
             decode = partial(_decode_queries, "logits", "pred_boxes", True)
-            return Layout("DETR", decode, classes - 1, mean=_MEAN, spread=_SPREAD)
-        return Layout("RT-DETR", partial(_decode_queries, "logits", "pred_boxes", False), classes)
+            return OutputLayout("DETR", decode, classes - 1, mean=_MEAN, spread=_SPREAD)
+        return OutputLayout("RT-DETR", partial(_decode_queries, "logits", "pred_boxes", False), classes)
     if {"labels", "boxes", "scores"} <= shapes.keys() and is_final:
-        return Layout("D-FINE", lambda given, _: Found(given["boxes"][0], given["scores"][0], given["labels"][0]))
+        return OutputLayout("D-FINE", lambda given, _: Found(given["boxes"][0], given["scores"][0], given["labels"][0]))
     if len(shapes.get("labels", ())) == 3 and shapes.get("dets", ())[2:] == (4,):
-        return Layout("RF-DETR", partial(_decode_queries, "labels", "dets", False), mean=_MEAN, spread=_SPREAD)
+        return OutputLayout("RF-DETR", partial(_decode_queries, "labels", "dets", False), mean=_MEAN, spread=_SPREAD)
     tables = [name for name, shape in shapes.items() if len(shape) == 3 and shape[0] == 1]
     masks = sum(shape[1] for shape in shapes.values() if len(shape) == 4)
     if len(tables) == 1 and (layout := _tell_yolo(tables[0], outputs[tables[0]], size, names, masks)) is not None:
@@ -89,7 +91,7 @@ def tell_layout(outputs: Outputs, size: Size, is_final: bool, names: int = 0, so
     )
 
 
-def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int, masks: int) -> Layout | None:
+def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int, masks: int) -> OutputLayout | None:
     """Return the layout of a single table. names: number of classes; it tells classes from keypoints.
 
     masks: number of coefficients of masks, which follow the classes; 0 for a network without masks.
@@ -101,18 +103,20 @@ def _tell_yolo(key: str, table: np.ndarray, size: Size, names: int, masks: int) 
     classes -= masks if masks < classes else 0
     classes = names if 0 < names < classes else classes
     if is_turned:
-        return Layout("YOLOv8", lambda given, _: _best(given[key][0].T, 4, classes), classes, "centre", 0.7)
+        return OutputLayout("YOLOv8", lambda given, _: _best(given[key][0].T, 4, classes), classes, "centre", 0.7)
     if columns > 5 and rows in cells:
         is_raw = np.abs(table[..., :4]).max() < _MOST_RAW
         if is_raw or (table[..., 4] != 1).any():
             strides = _STRIDES[cells.index(rows)] if is_raw else ()
             decode = partial(_decode_grid, key, strides, classes)
-            return Layout("YOLOX", decode, classes, "corner", 0.45, is_rgb=False, spread=(1.0, 1.0, 1.0))
+            return OutputLayout("YOLOX", decode, classes, "corner", 0.45, is_rgb=False, spread=(1.0, 1.0, 1.0))
     if columns > 5 and rows in [*cells, *(3 * count for count in cells)]:  # YOLOv6 has one box a cell, YOLOv5 three
         name = "YOLOv6" if rows in cells else "YOLOv5"
-        return Layout(name, lambda given, _: _best(given[key][0], 5, classes), classes, "centre", 0.45)
+        return OutputLayout(name, lambda given, _: _best(given[key][0], 5, classes), classes, "centre", 0.45)
     if columns == 6:
-        return Layout("YOLO without NMS", lambda given, _: Found(*np.split(given[key][0], [4, 5], 1)), 0, "centre")
+        return OutputLayout(
+            "YOLO without NMS", lambda given, _: Found(*np.split(given[key][0], [4, 5], 1)), 0, "centre"
+        )
     return None
 
 

@@ -34,7 +34,7 @@ _INNER = ("", "masks", "frames", "ground/*", "truth", "truth/masks")
 _Taken = TypeVar("_Taken", contravariant=True)
 
 
-class Part(Protocol[_Taken]):
+class OutputPart(Protocol[_Taken]):
     """A part of a run's output: tables, masks, an overlay, maps, the log."""
 
     def write(self, item: _Taken, /) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import Part, write_whole
+from torchvision_dddas.io.atomic_files import OutputPart, write_whole
 from torchvision_dddas.memory import MASK, PICTURE, check_memory
 from torchvision_dddas.types import Scene
 
@@ -363,7 +363,7 @@ def _find_shares(image: np.ndarray) -> np.ndarray:
     return values[[round(share * (len(values) - 1)) for share in _SHARES]].astype(float)
 
 
-class Masks(Part[Scene]):
+class Masks(OutputPart[Scene]):
     """Write masks/000001.png and so on, each whole or not at all. Masks with values over 255 have 16 bits, others 8."""
 
     def __init__(self, folder: Path) -> None:

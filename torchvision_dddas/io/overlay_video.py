@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import Part, PartFile, utf8_name, write_whole
+from torchvision_dddas.io.atomic_files import OutputPart, PartFile, utf8_name, write_whole
 
 Item = TypeVar("Item")
 
@@ -62,7 +62,7 @@ class OverlayVideo(Generic[Item]):
             self._part.discard()
 
 
-class OverlayPicture(Part[Item]):
+class OverlayPicture(OutputPart[Item]):
     """Write overlay.png, the picture of the last item."""
 
     def __init__(self, folder: Path, draw: Callable[[Item], np.ndarray]) -> None:

@@ -93,7 +93,7 @@ class _Decision:
         return Proposal(kind, place, self.taken_s, altitude_m, self.camera_deg)
 
 
-class _Vehicle:
+class _CommandedVehicle:
     """A vehicle with its rules, its last reports, and the last commands. name: "" for the UAV."""
 
     def __init__(self, name: str, limits: Limits) -> None:
@@ -143,12 +143,12 @@ class LiveCommands:
             raise InputError("--allow-commands needs places in degrees: give --telemetry or --landmarks with them")
         self.component = MavlinkComponent(link, size_px, rate_hz, health.event, limits.system)
         self.component.is_geographic = origin is not None
-        self.uav = _Vehicle("", limits)
+        self.uav = _CommandedVehicle("", limits)
         # A ground vehicle follows the ground, so that the band is of no use for it.
         free = None if limits.altitude_m is None else (-math.inf, math.inf)
         self._vehicles = [
             self.uav,
-            *(_Vehicle(n, replace(limits, system=s, altitude_m=free)) for n, s in ground.items()),
+            *(_CommandedVehicle(n, replace(limits, system=s, altitude_m=free)) for n, s in ground.items()),
         ]
         self._link, self._health, self._clock, self._origin = link, health, clock, origin
         self._steering: Steering | None = None
@@ -261,7 +261,7 @@ class LiveCommands:
         assert self._origin is not None
         return None if place is None else geometry.lonlat(np.asarray(place, float)[None], self._origin)[0]
 
-    def _view(self, vehicle: _Vehicle, decision: _Decision, place: tuple[float, float], now_s: float) -> None:
+    def _view(self, vehicle: _CommandedVehicle, decision: _Decision, place: tuple[float, float], now_s: float) -> None:
         """Point the camera at a place: by the gimbal's manager if there is one, else by a region of interest."""
         dialect, safety = self._link.dialect, vehicle.safety
         us = self.component.system, self.component.component
@@ -291,7 +291,7 @@ class LiveCommands:
             proposal = decision.propose("gimbal", place)
             self._transmit(vehicle, proposal, turn, np.array([pitch_deg, yaw_deg]), words, now_s)
 
-    def _go(self, vehicle: _Vehicle, decision: _Decision, place: tuple[float, float], now_s: float) -> None:
+    def _go(self, vehicle: _CommandedVehicle, decision: _Decision, place: tuple[float, float], now_s: float) -> None:
         safety, band = vehicle.safety, vehicle.safety.limits.altitude_m
         is_begun = "reposition" in vehicle.sent and math.isfinite(vehicle.altitude[1])
         if decision.altitude_m != vehicle.altitude[0] or not is_begun:
@@ -316,7 +316,7 @@ class LiveCommands:
         return geometry.east_north(np.array([place]), self._origin)[0]
 
     def _transmit(
-        self, vehicle: _Vehicle, proposal: Proposal, message: Any, value: np.ndarray, words: str, now_s: float
+        self, vehicle: _CommandedVehicle, proposal: Proposal, message: Any, value: np.ndarray, words: str, now_s: float
     ) -> None:
         """Send a command that is permitted and new, or record it in a dry run. value: what makes it new, see _NEAR."""
         kind, before = proposal.kind, vehicle.sent.get(proposal.kind)
@@ -339,12 +339,12 @@ class LiveCommands:
         else:
             self._health.event("command", vehicle.put(f"would {words}"))
 
-    def _tell(self, vehicle: _Vehicle, words: str) -> None:
+    def _tell(self, vehicle: _CommandedVehicle, words: str) -> None:
         if words != vehicle.told:
             vehicle.told = words
             self._health.event("command", vehicle.put(words))
 
-    def _tell_end(self, vehicle: _Vehicle) -> None:
+    def _tell_end(self, vehicle: _CommandedVehicle) -> None:
         if vehicle.safety.ended and not vehicle.is_over:
             vehicle.is_over = True
             words = vehicle.put(f"commanding has ended: {vehicle.safety.ended}")
@@ -360,7 +360,7 @@ class LiveCommands:
         except Exception as error:
             self._fail(error)
 
-    def _take(self, vehicle: _Vehicle, message: Any, now_s: float) -> None:
+    def _take(self, vehicle: _CommandedVehicle, message: Any, now_s: float) -> None:
         """Tell the safety rules of a vehicle what a message says."""
         kind, system, component = message.get_type(), message.get_srcSystem(), message.get_srcComponent()
         safety, us = vehicle.safety, (self.component.system, self.component.component)

@@ -21,7 +21,7 @@ _QUICKER = ("fast", "half")  # configurations in the order in which they are tri
 
 
 @dataclass
-class Look:
+class ClipSurvey:
     """Facts from the first frames of a clip, filled while a pipeline processes them.
 
     sides_px, squares_px: longer side of the box and root of the area of each detection. flows_px: background motion of
@@ -69,9 +69,9 @@ class _Excerpt:
             start = time.perf_counter()
 
 
-def look_at(source: Source, ready: Assembly, frames: int, tick: Callable[[], None] = lambda: None) -> Look:
+def look_at(source: Source, ready: Assembly, frames: int, tick: Callable[[], None] = lambda: None) -> ClipSurvey:
     """Process the first frames of a clip. tick: called after each result. Raise InputError for fewer than 3 frames."""
-    excerpt, look, begun = _Excerpt(source, frames), Look(), (time.perf_counter(), 0, 0.0)
+    excerpt, look, begun = _Excerpt(source, frames), ClipSurvey(), (time.perf_counter(), 0, 0.0)
     for result in Pipeline.from_assembly(ready, seen=look.see, pictures=False)(excerpt):
         if not begun[1]:  # do not time loading and warming up before the first result
             begun = time.perf_counter(), excerpt.taken, excerpt.waited_s
@@ -93,7 +93,7 @@ def distances_over(ready: Assembly, source: Source, frames: int) -> list[Distanc
     return [settings_at(f, source.rate_hz, ready.settings) for f in flights if f is not None and f.altitude_m > 0]
 
 
-def describe_sizes(look: Look, ready: Assembly, distances: list[DistanceSettings]) -> list[str]:
+def describe_sizes(look: ClipSurvey, ready: Assembly, distances: list[DistanceSettings]) -> list[str]:
     """Return lines on the sizes of targets that follow from the log, and on the sizes that were found."""
     known = [at for at in distances if at.person_px and at.flight is not None]
     if known:
@@ -119,7 +119,7 @@ def describe_sizes(look: Look, ready: Assembly, distances: list[DistanceSettings
     return [*lines, found + ("" if known else "; sizes in pixels do not distinguish people from vehicles")]
 
 
-def describe_clip(look: Look, source: Source) -> list[str]:
+def describe_clip(look: ClipSurvey, source: Source) -> list[str]:
     """Return lines on the camera's motion, the delay of the results, and the cost on this machine."""
     rate_hz, lines = source.rate_hz, []
     if look.flows_px:
@@ -142,13 +142,13 @@ def describe_clip(look: Look, source: Source) -> list[str]:
 
 
 def choose_options(
-    look: Look,
+    look: ClipSurvey,
     ready: Assembly,
     distances: list[DistanceSettings],
     *,
     rate_hz: float,
     live: bool,
-    look_with: Callable[[str], Look],
+    look_with: Callable[[str], ClipSurvey],
 ) -> tuple[dict[str, str], list[str]]:
     """Return options of `dddas run` with their reasons, and remarks. live: whether the source is a stream.
 

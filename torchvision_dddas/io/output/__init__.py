@@ -1,6 +1,6 @@
 """The output of runs: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
-from torchvision_dddas.io.atomic_files import Part
+from torchvision_dddas.io.atomic_files import OutputPart
 from torchvision_dddas.io.output.map_files import MapSite
 from torchvision_dddas.io.output.recorder import PartOf, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
@@ -49,7 +49,7 @@ __all__ = [
     "Event",
     "GroundRecorder",
     "MapSite",
-    "Part",
+    "OutputPart",
     "PartOf",
     "PeopleRecorder",
     "PipelineRecorder",

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import readable
 from torchvision_dddas.geometry import edges_of, is_inside, lonlat
-from torchvision_dddas.io.atomic_files import Part, write_whole
+from torchvision_dddas.io.atomic_files import OutputPart, write_whole
 from torchvision_dddas.io.maps.formats import cot, ellipses_geojson, encode_geojson, geojson, kml
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
 from torchvision_dddas.io.maps.map_page import map_data
@@ -52,7 +52,7 @@ class MapSite:
         return {"origin_deg": self.origin_deg, "start_utc": begun, "rate_hz": self.rate_hz}
 
 
-class AerialMaps(Part[AerialLocations]):
+class AerialMaps(OutputPart[AerialLocations]):
     """Writes maps of targets located from the air: GeoJSON, KML, Cursor-on-Target, map.png and report.html.
 
     Memory: 120 bytes per place of a target or landmark, three times as much while the array grows, and about 800 bytes
@@ -181,7 +181,7 @@ class AerialMaps(Part[AerialLocations]):
         return report.html()
 
 
-class GroundMaps(Part[GroundLocations]):
+class GroundMaps(OutputPart[GroundLocations]):
     """Writes tracks.geojson and tracks.kml of people located from the ground, if longitudes and latitudes are known."""
 
     files = (GEOJSON, KML)

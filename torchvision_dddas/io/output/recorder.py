@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 from torchvision_dddas.errors import InputError, LostInputError
-from torchvision_dddas.io.atomic_files import ClaimedFolder, Part, cannot_write
+from torchvision_dddas.io.atomic_files import ClaimedFolder, OutputPart, cannot_write
 from torchvision_dddas.io.images import NUMBERED
 from torchvision_dddas.io.interrupts import KEPT, is_stop, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, read_run_record
@@ -23,7 +23,7 @@ Whole = TypeVar("Whole")
 class PartOf(Generic[Whole, Item]):
     """A part that receives one field of each item."""
 
-    def __init__(self, part: Part[Item], field: Callable[[Whole], Item]) -> None:
+    def __init__(self, part: OutputPart[Item], field: Callable[[Whole], Item]) -> None:
         self._part, self._field = part, field
         self.close, self.discard = part.close, part.discard
 
@@ -35,7 +35,7 @@ class PartOf(Generic[Whole, Item]):
 class _Picture(Generic[Item]):
     """A part that only shows results. If it fails, a problem of the run is recorded, and the other parts continue."""
 
-    def __init__(self, name: str, part: Part[Item], record: RunRecord) -> None:
+    def __init__(self, name: str, part: OutputPart[Item], record: RunRecord) -> None:
         self.failure = ""
         self._name, self._part, self._record = name, part, record
         self.discard = part.discard
@@ -89,7 +89,7 @@ class RunRecorder(Generic[Item]):
         self._claim = _claim(folder, self.files, self.numbered)
         self._open = ExitStack()
         self._lock, self._is_closed = threading.RLock(), False
-        self._parts: list[Part[Item]] = []
+        self._parts: list[OutputPart[Item]] = []
         self._record: RunRecord | None = None
 
     @property
@@ -98,7 +98,7 @@ class RunRecorder(Generic[Item]):
         assert self._record is not None
         return self._record
 
-    def start(self, facts: Mapping[str, Any], parts: Mapping[str, Part[Item]]) -> RunRecord:
+    def start(self, facts: Mapping[str, Any], parts: Mapping[str, OutputPart[Item]]) -> RunRecord:
         """Begin the record with some facts, and set the parts, without parts that the user does not save.
 
         Parts are written in this order and closed in the reverse order. run.json is closed last.

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import Part
+from torchvision_dddas.io.atomic_files import OutputPart
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, MapSite
@@ -52,7 +52,7 @@ class DetectionRecorder(RunRecorder[Scene]):
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float) -> RunRecord:
         """Start the run. facts: entries for run.json. rate_hz: frame rate of the overlay."""
-        parts: dict[str, Part[Scene]] = {
+        parts: dict[str, OutputPart[Scene]] = {
             "tables": detection_tables(self.folder),
             "masks": Masks(self.folder),
             "overlay": OverlayVideo(self.folder, rate_hz, draw_scene),
@@ -75,7 +75,7 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
     def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> RunRecord:
         """Start the run. rate_hz, size: frame rate and (width, height) of the overlay."""
         pictures = RunPictures(size)
-        parts: dict[str, Part[TrackedFrame]] = {
+        parts: dict[str, OutputPart[TrackedFrame]] = {
             "tables": tables.track_tables(self.folder),
             "appearance": tables.appearance_table(self.folder),
             "overlay": OverlayVideo(self.folder, rate_hz, lambda tracked: pictures(FrameResult(tracked))),
@@ -102,7 +102,7 @@ class PeopleRecorder(RunRecorder[PeopleFrame]):
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> RunRecord:
         """Start the run. rate_hz: frame rate of the overlay. is_single: input and overlay are a single image."""
-        overlay: Part[PeopleFrame] = OverlayVideo(self.folder, rate_hz, draw_people)
+        overlay: OutputPart[PeopleFrame] = OverlayVideo(self.folder, rate_hz, draw_people)
         if is_single:
             overlay = OverlayPicture(self.folder, draw_people)
         record = self.start(
@@ -138,7 +138,7 @@ class GroundRecorder(RunRecorder[GroundLocations]):
 
     def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> RunRecord:
         """Start the run. cameras: names of the cameras. has_degrees: whether longitudes and latitudes are known."""
-        parts: dict[str, Part[GroundLocations]] = {
+        parts: dict[str, OutputPart[GroundLocations]] = {
             "tables": tables.ground_tables(self.folder, cameras, has_degrees),
             "maps": GroundMaps(self.folder, has_degrees),
         }
@@ -182,7 +182,7 @@ class ViewsRecorder(RunRecorder[SharedFrame]):
         self, facts: Mapping[str, Any], own: str, cells: Sequence[tuple[list[str], list[list[str]]]]
     ) -> RunRecord:
         """Start the run. own: column of the tables' own identities. cells: column names and cells of each table."""
-        parts: dict[str, Part[SharedFrame]] = {
+        parts: dict[str, OutputPart[SharedFrame]] = {
             f"view{k}": tables.view_table(self.folder, k, own, *view) for k, view in enumerate(cells)
         }
         record = self.start(
@@ -223,7 +223,7 @@ class AerialRecorder(RunRecorder[AerialLocations]):
         """Start the run."""
         maps = AerialMaps(self.folder, self.save, site)
         places = tables.aerial_tables(self.folder, site.origin_deg is not None, _grid(facts))
-        parts: dict[str, Part[AerialLocations]] = {"maps": maps, "tables": places}
+        parts: dict[str, OutputPart[AerialLocations]] = {"maps": maps, "tables": places}
         record = maps.record = self.start({**site.facts, **facts}, parts)
         record.notes += _missing_maps(site, self.save)
         self._counts = _LocationCounts(record, site.names)
@@ -266,7 +266,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         names = () if site is None else site.names
         pictures = RunPictures(size, names, zones)
         self.story = RunStory(folder, names, pictures if "report" in save else None, site is not None)
-        parts: dict[str, Part[FrameResult]] = {}
+        parts: dict[str, OutputPart[FrameResult]] = {}
         start_utc_s = math.nan if site is None else site.start_utc_s
         if site is not None:
             has_degrees = site.origin_deg is not None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import readable
-from torchvision_dddas.io.atomic_files import Part, write_whole
+from torchvision_dddas.io.atomic_files import OutputPart, write_whole
 from torchvision_dddas.io.maps.map_picture import Signs
 from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, KeyFrames, RunReport, describe_state, format_span
@@ -171,7 +171,7 @@ def format_log(entries: Iterable[Entry], clock: LogClock, heading: str) -> str:
     return "\n".join(out) + "\n"
 
 
-class RunStory(Part[FrameResult]):
+class RunStory(OutputPart[FrameResult]):
     """Writes log.txt, and collects the events, the timeline, the key frames and the map's signs for report.html.
 
     If a run locates nothing, no map exists, and this part writes report.html itself.

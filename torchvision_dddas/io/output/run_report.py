@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.io.output.run_record import RunRecord, finite
 from torchvision_dddas.io.output.timelines import Timeline
-from torchvision_dddas.io.report import Cell, Column, render_page, table
+from torchvision_dddas.io.report import Cell, ReportColumn, render_page, table
 
 REPORT = "report.html"
 MOST_TABLE_ROWS = 200
@@ -124,7 +124,7 @@ def location_tables(record: RunRecord) -> list[Table]:
 def _html_table(content: Table) -> dict[str, Any]:
     """Return a table's title, the HTML of its first MOST_TABLE_ROWS rows, the number of further rows, and a text."""
     title, names, rows, empty = content
-    columns = [Column(name, text=True) for name in names]
+    columns = [ReportColumn(name, text=True) for name in names]
     cells = [[_cell(value) for value in row] for row in rows[:MOST_TABLE_ROWS]]
     html = table(title, columns, cells) if rows else ""
     return {"title": title, "html": html, "more": len(rows) - len(cells), "empty": empty}

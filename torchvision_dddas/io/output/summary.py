@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.geometry import Jitter
-from torchvision_dddas.io.atomic_files import Part
+from torchvision_dddas.io.atomic_files import OutputPart
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.io.tables import DEGREES, EAST_NORTH, Column, Schema, TableFiles
 from torchvision_dddas.types import FrameResult, most_common
@@ -94,7 +94,7 @@ class _Row:
         return [self.path_m + rest_m, self.path_m / lapse, math.sqrt(max(variance, 0.0)) / lapse, *self.top]
 
 
-class Summary(Part[FrameResult]):
+class Summary(OutputPart[FrameResult]):
     """Writes summary.csv. Memory: about 2 kB per target."""
 
     def __init__(self, folder: Path, start_utc_s: float = math.nan) -> None:

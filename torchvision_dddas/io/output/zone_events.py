@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import Part, write_whole
+from torchvision_dddas.io.atomic_files import OutputPart, write_whole
 from torchvision_dddas.io.maps.formats import MARK_STALE_S, event_uid, mark
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.io.output.run_report import Table
@@ -91,7 +91,7 @@ def zone_table(counts: dict[str, dict[str, Any]]) -> Table:
     return "Events by place", ("zone", "targets", "by class", "events"), rows, ""
 
 
-class EventFiles(Part[FrameResult]):
+class EventFiles(OutputPart[FrameResult]):
     """Writes the files of events. events.geojson needs longitudes and latitudes, and also holds the zones in degrees.
 
     events.cot.xml holds marks as Cursor-on-Target. It also needs a clock.

@@ -46,7 +46,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Column:
+class ReportColumn:
     """A column's name and its meaning. text: the cells hold words and are aligned to the left."""
 
     name: str
@@ -55,11 +55,11 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table for a page or a file. caption: name of the table. foot: rows that stay below the others."""
 
     caption: str
-    columns: Sequence[Column]
+    columns: Sequence[ReportColumn]
     rows: Sequence[Sequence[Cell]]
     foot: Sequence[Sequence[Cell]] = ()
 
@@ -76,7 +76,7 @@ def render_page(template: str, **context: Any) -> str:
 
 def table(
     caption: str,
-    columns: Sequence[Column],
+    columns: Sequence[ReportColumn],
     rows: Sequence[Sequence[Cell]],
     foot: Sequence[Sequence[Cell]] = (),
     sorts: bool = True,

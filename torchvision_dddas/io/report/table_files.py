@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torchvision_dddas.io.atomic_files import save_file
-from torchvision_dddas.io.report import Cell, Table
+from torchvision_dddas.io.report import Cell, ReportTable
 
 _LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
@@ -14,14 +14,14 @@ _LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
 }  # fmt: skip
 
 
-def save_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+def save_tables(folder: Path, tables: Mapping[str, ReportTable]) -> None:
     """Write each table as NAME.csv, NAME.tex and NAME.md. Raise InputError if a file cannot be written."""
     for name, table in tables.items():
         for ending, write in {"csv": to_csv, "tex": to_latex, "md": to_markdown}.items():
             save_file(folder / f"{name}.{ending}", write(table).encode())
 
 
-def to_csv(table: Table) -> str:
+def to_csv(table: ReportTable) -> str:
     """Return a table as CSV with all digits. Intervals become columns of text, and unknown values stay empty."""
     rows = [*table.rows, *table.foot]
     spans = [any(row[k].small for row in rows) for k in range(len(table.columns))]
@@ -37,7 +37,7 @@ def to_csv(table: Table) -> str:
     return text.getvalue()
 
 
-def to_latex(table: Table) -> str:
+def to_latex(table: ReportTable) -> str:
     r"""Return a tabular with the rules of booktabs. Intervals are set small, and the best values bold."""
 
     def escape(text: str) -> str:
@@ -60,7 +60,7 @@ def to_latex(table: Table) -> str:
     )
 
 
-def to_markdown(table: Table) -> str:
+def to_markdown(table: ReportTable) -> str:
     """Return a table in GitHub's Markdown. Intervals follow in brackets, and the best values are bold."""
 
     def fill(cell: Cell) -> str:

@@ -17,7 +17,7 @@ from torchvision_dddas.config import Settings, format_toml, with_parameters
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.camera_files import DISTORTION
 from torchvision_dddas.io.colour_files import format_colours
-from torchvision_dddas.io.output import RUN_JSON, Part, PartOf, RunRecord, RunRecorder
+from torchvision_dddas.io.output import RUN_JSON, OutputPart, PartOf, RunRecord, RunRecorder
 from torchvision_dddas.io.overlay_video import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.lab.simulation.scenario import Scenario, load_scenario, scenario_settings, scenario_toml
@@ -175,7 +175,7 @@ class _RecordingOutput(RunRecorder[_Recorded]):
             texts["colours.toml"] = format_colours(colours)
         lonlat = partial(geometry.lonlat, origin_deg=scenario.world.origin_deg)
         truth = TruthOutput(folder, lonlat, "masks" in self.save)
-        parts: dict[str, Part[_Recorded]] = {
+        parts: dict[str, OutputPart[_Recorded]] = {
             "tables": _Tables(folder, simulator.names, texts),
             "truth": PartOf(truth, lambda item: item.shot.truth),
             "frames": _Frames(folder / "frames"),
@@ -247,7 +247,7 @@ class _Served:
         self._files.close()
 
 
-class _Frames(Part[_Recorded]):
+class _Frames(OutputPart[_Recorded]):
     """Writes frames/000001.jpg and so on. A dropped frame is an empty file, so that the others keep their numbers."""
 
     def __init__(self, folder: Path) -> None:

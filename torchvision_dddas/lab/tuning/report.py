@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.io.report import Cell, Column, format_number, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report import Cell, ReportColumn, format_number, number_cell, render_page, table, text_cell
 from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
 from torchvision_dddas.lab.evaluation.metrics.registry import describe, title_of_group
 from torchvision_dddas.lab.evaluation.studies.comparison import MEANING, comparison_section
@@ -111,8 +111,14 @@ def _column(steps: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
 
 
 def _parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Markup:
-    words = [Column(name, text=True) for name in ("unit", "range", "meaning")]
-    columns = [Column("parameter", text=True), Column("before"), Column("after"), Column("times"), *words]
+    words = [ReportColumn(name, text=True) for name in ("unit", "range", "meaning")]
+    columns = [
+        ReportColumn("parameter", text=True),
+        ReportColumn("before"),
+        ReportColumn("after"),
+        ReportColumn("times"),
+        *words,
+    ]
     rows = []
     for name, parameter in parameters.items():
         before, after = float(parameter["before"]), float(parameter["after"])

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.io.atomic_files import save_file
-from torchvision_dddas.io.report import Cell, Column, Table, number_cell, render_page, text_cell
+from torchvision_dddas.io.report import Cell, ReportColumn, ReportTable, number_cell, render_page, text_cell
 from torchvision_dddas.io.report.charts import interval_chart
 from torchvision_dddas.io.report.figure_files import save_figures
 from torchvision_dddas.io.report.table_files import save_tables
@@ -28,7 +28,7 @@ Methods = Mapping[str, Mapping[str, Any]]
 def save_methods(folder: Path, content: Mapping[str, Any]) -> None:
     """Write report.html, tables/ and figures/. content: content of comparison.json, with None for NaN."""
     methods = content["methods"]
-    tables: dict[str, Table] = {}
+    tables: dict[str, ReportTable] = {}
     tasks: list[dict[str, Any]] = []
     first = next(iter(methods))
     for task, whole in methods[first]["tasks"].items():
@@ -62,7 +62,7 @@ def save_methods(folder: Path, content: Mapping[str, Any]) -> None:
     save_figures(folder / "figures", page)
 
 
-def _method_table(methods: Methods, group: str) -> Table:
+def _method_table(methods: Methods, group: str) -> ReportTable:
     """Return a row for each method: figures over all clips with their intervals, the best of each measure in bold."""
     names = [name for name in GROUPS[group].shown if any(name in mine.get(group, {}) for mine in methods.values())]
     columns: list[list[Cell]] = []
@@ -72,9 +72,12 @@ def _method_table(methods: Methods, group: str) -> Table:
         values = [known.better * one.value for one in found if one.value == one.value]  # NaN is not equal to itself
         best = max(values) if known.better and values else None
         columns.append([replace(c, best=known.better * f.value == best) for c, f in zip(digits, found, strict=True)])
-    heads = [Column("method", text=True), *(Column(describe(name).title, describe(name).meaning) for name in names)]
+    heads = [
+        ReportColumn("method", text=True),
+        *(ReportColumn(describe(name).title, describe(name).meaning) for name in names),
+    ]
     rows = [[text_cell(method), *cells] for method, *cells in zip(methods, *columns, strict=True)]
-    return Table(f"{title_of_group(group)}, all clips together", heads, rows)
+    return ReportTable(f"{title_of_group(group)}, all clips together", heads, rows)
 
 
 def _method_chart(methods: Methods, group: str, name: str) -> Any:

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.io.report import (
     Cell,
-    Column,
-    Table,
+    ReportColumn,
+    ReportTable,
     format_count,
     format_number,
     number_cell,
@@ -103,7 +103,7 @@ def _shown(metrics: Mapping[str, Any], group: str) -> list[str]:
     return [name for name in GROUPS[group].shown if _known_figures(metrics, group, name)]
 
 
-def study_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
+def study_tables(metrics: Mapping[str, Any]) -> dict[str, ReportTable]:
     """Return the tables of measures by TASK-GROUP. metrics: as for `study_report`."""
     return {
         f"{task}-{group}": _measure_table(mine, group)
@@ -113,12 +113,12 @@ def study_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
     }
 
 
-def _measure_table(metrics: Mapping[str, Any], group: str) -> Table:
+def _measure_table(metrics: Mapping[str, Any], group: str) -> ReportTable:
     """Return a row for each clip, then rows for all clips together; each figure with its interval."""
     names = _shown(metrics, group)
     known = [describe(name) for name in names]
-    columns = [Column("clip", text=True), Column("frames", "frames scored")]
-    columns += [Column(metric.title, metric.meaning) for metric in known]
+    columns = [ReportColumn("clip", text=True), ReportColumn("frames", "frames scored")]
+    columns += [ReportColumn(metric.title, metric.meaning) for metric in known]
 
     def cells(groups: Groups) -> list[Cell]:
         figures = [figure_of(groups, group, name) for name in names]
@@ -128,7 +128,7 @@ def _measure_table(metrics: Mapping[str, Any], group: str) -> Table:
     rows = [[text_cell(name), number_cell(groups["frames"]), *cells(groups)] for name, groups in clips.items()]
     whole = {"pooled": metrics["pooled"], "mean over clips": metrics["mean"]} if len(rows) > 1 else {}
     foot = [[text_cell(title), Cell(""), *cells(groups)] for title, groups in whole.items() if group in groups]
-    return Table(f"{title_of_group(group)}, clip by clip", columns, rows, foot)
+    return ReportTable(f"{title_of_group(group)}, clip by clip", columns, rows, foot)
 
 
 def _measure_plot(metrics: Mapping[str, Any], group: str) -> list[tuple[Markup, str]]:
@@ -196,13 +196,13 @@ def _cost_table(cases: Sequence[Case]) -> Markup:
         total.update({stage: ms * cost["frames"] for stage, ms in cost["ms_per_frame"].items()})
     stages = [stage for stage, _ in total.most_common(MAX_STAGES)]
     columns = [
-        Column("clip", text=True),
-        Column("task", text=True),
-        Column("frames", "processed pictures"),
-        Column("s", "seconds in all"),
-        Column("frames/s", "processed pictures per second"),
-        Column("MB", "the largest memory of the process"),
-        *(Column(f"{stage}, ms", "milliseconds a frame") for stage in stages),
+        ReportColumn("clip", text=True),
+        ReportColumn("task", text=True),
+        ReportColumn("frames", "processed pictures"),
+        ReportColumn("s", "seconds in all"),
+        ReportColumn("frames/s", "processed pictures per second"),
+        ReportColumn("MB", "the largest memory of the process"),
+        *(ReportColumn(f"{stage}, ms", "milliseconds a frame") for stage in stages),
     ]
     rows = [
         [
@@ -248,7 +248,7 @@ def _fact_table(results: Results) -> Markup:
         for name, value in facts.items()
         if value not in ("", [], (), None)
     ]
-    return table("what was run", [Column("what", text=True), Column("value", text=True)], rows, sorts=False)
+    return table("what was run", [ReportColumn("what", text=True), ReportColumn("value", text=True)], rows, sorts=False)
 
 
 def _in_words(value: Any) -> str:

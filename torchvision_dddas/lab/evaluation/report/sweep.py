@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.io.atomic_files import save_file
-from torchvision_dddas.io.report import Cell, Column, Table, number_cell, render_page, text_cell
+from torchvision_dddas.io.report import Cell, ReportColumn, ReportTable, number_cell, render_page, text_cell
 from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
 from torchvision_dddas.io.report.figure_files import save_figures
 from torchvision_dddas.io.report.table_files import save_tables
@@ -22,8 +22,13 @@ def save_sweep(record: "SweepRecord") -> None:
     goal, first, best = record.goal, record.trials[0], record.best
     assert best is not None
     known, parameters = describe(goal.measure), list(record.defaults)
-    columns = [Column(name, f"default {record.defaults[name]}", text=True) for name in parameters]
-    columns = [Column("trial"), *columns, Column(known.title, known.meaning), Column("note", text=True)]
+    columns = [ReportColumn(name, f"default {record.defaults[name]}", text=True) for name in parameters]
+    columns = [
+        ReportColumn("trial"),
+        *columns,
+        ReportColumn(known.title, known.meaning),
+        ReportColumn("note", text=True),
+    ]
     rows = []
     for trial in record.trials:
         values = [record.value_of(trial, name) for name in parameters]
@@ -32,7 +37,7 @@ def save_sweep(record: "SweepRecord") -> None:
         note = trial.cause or ("the original settings" if trial is first else "")
         value = Cell(value.text, value.value, best=trial is best)
         rows.append([number_cell(trial.number), *cells, value, text_cell(note)])
-    trials = Table("trials", columns, rows)
+    trials = ReportTable("trials", columns, rows)
     lines = [f"best: trial {best.number}, {best.value:.4f}; the original settings: {number_cell(first.value, 4).text}"]
     if record.on_held is not None:
         before, after = (number_cell(value, 4).text for value, _ in record.on_held)

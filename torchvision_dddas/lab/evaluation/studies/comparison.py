@@ -8,7 +8,15 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.report import Cell, Column, Table, format_number, number_cell, render_page, text_cell
+from torchvision_dddas.io.report import (
+    Cell,
+    ReportColumn,
+    ReportTable,
+    format_number,
+    number_cell,
+    render_page,
+    text_cell,
+)
 from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
 from torchvision_dddas.lab.evaluation.metrics import bootstrap
 from torchvision_dddas.lab.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
@@ -253,7 +261,7 @@ def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], firs
 
     anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
-    columns = [Column("clip", text=True), *_columns(first, second, {WAYS[1]: ""})]
+    columns = [ReportColumn("clip", text=True), *_columns(first, second, {WAYS[1]: ""})]
     by_clip = [
         [text_cell(clip), *_cells(group, name, entry, WAYS[1:])]
         for clip, groups in changes["clips"].items()
@@ -265,27 +273,32 @@ def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], firs
         title=title,
         charts=_charts(changes["clips"]),
         pooled=pooled_changes(changes, first, second).markup,
-        by_clip=by_clip and Table("clip by clip", columns, by_clip).markup,
+        by_clip=by_clip and ReportTable("clip by clip", columns, by_clip).markup,
         same=changes["same"],
     )
     return Markup(section)
 
 
-def pooled_changes(changes: Mapping[str, Any], first: str, second: str) -> Table:
+def pooled_changes(changes: Mapping[str, Any], first: str, second: str) -> ReportTable:
     """Return the table of the changes over all clips. The arguments are those of `comparison_section`."""
     columns = _columns(first, second, {WAYS[0]: ", clips", WAYS[1]: ", frames"})
-    columns += [Column("effect size", "Cohen's d_z"), Column("clips needed", "for a power of 0.8")]
+    columns += [ReportColumn("effect size", "Cohen's d_z"), ReportColumn("clips needed", "for a power of 0.8")]
     rows = []
     for group, name, entry in entries_of(changes["pooled"]):
         needed = [number_cell(entry.get("effect_size"), 2), number_cell(entry.get("clips_needed"))]
         rows.append([*_cells(group, name, entry, WAYS), *needed])
-    return Table("all clips together", columns, rows)
+    return ReportTable("all clips together", columns, rows)
 
 
-def _columns(first: str, second: str, ways: Mapping[str, str]) -> list[Column]:
-    tests = [Column(f"{p}{over}") for over in ways.values() for p in ("raw p", "corrected p")]
-    ends = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
-    return [*ends, Column("verdict", text=True), *tests]
+def _columns(first: str, second: str, ways: Mapping[str, str]) -> list[ReportColumn]:
+    tests = [ReportColumn(f"{p}{over}") for over in ways.values() for p in ("raw p", "corrected p")]
+    ends = [
+        ReportColumn("measure", text=True),
+        ReportColumn(first),
+        ReportColumn(second),
+        ReportColumn("change", "with its 95 % interval"),
+    ]
+    return [*ends, ReportColumn("verdict", text=True), *tests]
 
 
 def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
