@@ -36,7 +36,7 @@ class View:
 
     @cached_property
     def level_shares(self) -> np.ndarray:
-        """The (33,) quantiles of the grey levels; see `measure_level_shares`."""
+        """The grey levels of the picture at 33 shares of its pixels, (33,); see `measure_level_shares`."""
         return measure_level_shares(self.grey)
 
 

@@ -21,8 +21,8 @@ ARC = tuple(
 )
 TINY = 2.220446049250313e-16  # OpenCV adds this to the divisor
 
-# L2-Hys: SOFT_FIRST for each number of a block is added to the norm before the clip, and SOFT_SECOND after it
-# (modules/objdetect, hog.cpp).
+# OpenCV's L2-Hys (modules/objdetect, hog.cpp) adds SOFT_FIRST for each number of a block to the norm before it clips
+# the numbers, and SOFT_SECOND to the norm after that.
 SOFT_FIRST, SOFT_SECOND = 0.1, 1e-3
 
 

@@ -41,7 +41,7 @@ _HOG_KEYS = {
 }
 """The keys of a HOGDescriptor that OpenCV saved."""
 _MOST_NUMBERS = 1_000_000  # largest accepted array; descriptors have thousands of numbers
-_LONGEST_HEADER = 10_000  # longest accepted array header, bytes; NumPy refuses longer headers after allocating memory
+_LONGEST_HEADER = 10_000  # bytes of an array header; NumPy allocates memory before it refuses more
 _MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # the start of a key, list, item or tag in a file that OpenCV saved
 _MOST_MARKS = 10_000  # OpenCV crashes on parts that are nested more than twice as deep
 _DIGITS = 1e-6  # tolerance of a comparison: files store a clip of 0.2 with different rounding

@@ -201,7 +201,7 @@ def _solve_exactly(
     """Return the best choice of these triplets, if it gains more than `value`, and whether it is certainly the best."""
     worth, price = gain[tuple(nodes.T)], np.concatenate(prices)
     named = nodes + np.cumsum([0, *gain.shape[:2]])
-    # Targets that are in none of the triplets stay alone, so they lose their prices in any case.
+    # Targets that occur in none of the triplets stay alone. Their prices are lost whatever is chosen.
     spare = float(price.sum() - price[np.unique(named[nodes > 0])].sum())
     held = [row[real].tolist() for row, real in zip(named, nodes > 0, strict=True)]
     limit = price.sum() - value - spare + _SAME

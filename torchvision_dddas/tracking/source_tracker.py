@@ -382,7 +382,7 @@ def associate(
 ) -> Association:
     """Assign the targets of two or three frames: weigh, gate, solve.
 
-    affinities: affinities of the window by feature, if they were computed in a batch.
+    affinities: by feature, if a batch computed them already.
     """
     weight, location, appearance = weigh(window, parameters)
 

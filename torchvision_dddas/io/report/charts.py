@@ -330,7 +330,7 @@ def _event_rows(events: Sequence[Events], plot: _Plot) -> list[str]:
 
 
 def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float) -> tuple[list[str], int]:
-    """Return a sign and a name for each series, in rows between left and right, and the height of these rows."""
+    """Return the legend, with a sign and a name for each series in rows, and the height of the rows."""
     parts, x, row = [], left, 0
     for one in series:
         name = one.name if len(one.name) <= 40 else f"{one.name[:39]}…"

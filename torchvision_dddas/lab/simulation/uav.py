@@ -39,7 +39,7 @@ class Swaying:
             lasting = np.diag([1.0, k**2])
             self._steps[seconds] = step, np.linalg.cholesky(lasting - step @ lasting @ step.T + 1e-15 * np.eye(2))
         step, factor = self._steps[seconds]
-        rest = np.asarray(push) / self._rate**2  # place of rest under the push
+        rest = np.asarray(push) / self._rate**2  # the value at which a constant push holds the system
         moved = step @ np.stack([self.value - rest, self.rate])
         noise = factor @ self._rng.standard_normal((2, len(self._sigma))) * self._sigma * rougher
         self.value, self.rate = moved[0] + noise[0] + rest, moved[1] + noise[1]

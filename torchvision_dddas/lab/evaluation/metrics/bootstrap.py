@@ -90,7 +90,7 @@ def percentiles(values: np.ndarray, count: float) -> ConfidenceInterval | None:
 
 
 def block_length(series: np.ndarray) -> int:
-    """Return the number of neighbours in a block so that blocks count as independent: the largest over all columns.
+    """Return how many units make a block, so that blocks are nearly independent: the largest need of all columns.
 
     series: (U, K), the contribution of each unit, in order, to each measure. The length is at most the units divided by
     FEWEST. Source: Politis and White, 2004, with the correction of 2009, for the circular block bootstrap.
