@@ -302,3 +302,12 @@ def test_labels_have_the_class_and_the_speed_in_metres_where_targets_are_located
     draw(image(), tracks)
     draw(image(), replace(one, tracked=replace(one.tracked, tracks=tracks), locations=located))
     assert said == ["1 car", "1 car 5.0 m/s"]
+
+
+def test_a_label_at_the_right_edge_is_as_wide_as_one_in_the_middle():
+    widths = []
+    for x in (20.0, 190.0):
+        picture = np.zeros((60, 200, 3), np.uint8)
+        overlay.label(picture, np.array([x, 30.0, 8.0, 8.0]), "7 car", (255, 255, 255))
+        widths.append(int((picture == 255).all(axis=2).any(axis=0).sum()))
+    assert widths[0] == widths[1] > 20

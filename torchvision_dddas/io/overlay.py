@@ -71,10 +71,12 @@ def rectangle(picture: np.ndarray, box: np.ndarray, colour: Colour, thick: int) 
 
 
 def label(picture: np.ndarray, box: np.ndarray, text: str, colour: Colour) -> None:
-    """Write a text on a coloured patch, above the box if there is room."""
+    """Write a text on a coloured patch, above the box if there is room, and within the right edge of the picture."""
     scale, thick = max(picture.shape[0] / 1200, 0.35), line_width(picture)
     (width, height), _ = cv2.getTextSize(text, _FONT, scale, thick)
     x, y = drawable(box[:2]).tolist()
+    if 0 <= x < picture.shape[1]:
+        x = max(min(x, picture.shape[1] - width - 4), 0)
     top = y - height - 4 if y >= height + 4 else y
     cv2.rectangle(picture, (x, top), (x + width + 3, top + height + 3), colour, -1)
     cv2.putText(picture, text, (x + 2, top + height + 1), _FONT, scale, (0, 0, 0), thick, cv2.LINE_AA)
