@@ -10,6 +10,7 @@ from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
 from torchvision_dddas.chain import fit_exposure, match_exposure
 from torchvision_dddas.detection import View, Window, load_engine
+from torchvision_dddas.detection.engine import judge_points
 from torchvision_dddas.detection.opencv_engine import detect_keypoints
 from torchvision_dddas.geometry import corner_error
 
@@ -102,3 +103,15 @@ def test_corners_found_at_half_resolution_are_on_even_pixels_the_same_in_both_en
     other = load_engine("onboard", settings)
     (onboard,) = other.register([(other.prepare(clip.images[0]), other.prepare(clip.images[1]))])
     assert step.reliable and corner_error(step.later_from_earlier, onboard.later_from_earlier, size) <= 0.5
+
+
+@pytest.mark.parametrize(("agree", "is_reliable"), [(120, True), (30, True), (19, False), (7, False)])
+def test_one_background_motion_may_hold_for_a_quarter_of_the_keypoints_as_over_water(agree, is_reliable) -> None:
+    """Of pictures that show different scenes, at most seven keypoints agree."""
+    rng = np.random.default_rng(0)
+    start = rng.uniform(0, 600, (120, 2))
+    end = start + (5, -3)
+    end[agree:] += rng.uniform(10, 40, (120 - agree, 2))
+    step = np.array([[1, 0, 5], [0, 1, -3], [0, 0, 1.0]])
+    record, inliers = judge_points(step, start, end, (640, 640), parameters.Settings().registration)
+    assert record.reliable == is_reliable and inliers.sum() == agree

@@ -59,7 +59,7 @@ class RegistrationParameters(Group):
         False, "register a frame directly to each compared frame, as the source does; false chains successive steps"
     )
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
-    min_inlier_share: float = parameter(0.4, "with a smaller inlier share the registration is unreliable", "-", 0, 1)
+    min_inlier_share: float = parameter(0.2, "with a smaller inlier share the registration is unreliable", "-", 0, 1)
 
     def cell_side(self, width: int, height: int) -> int:
         """Return the side in pixels of the grid cells, such that one keypoint a cell is within the budget."""
