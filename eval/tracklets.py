@@ -104,8 +104,8 @@ class _WholeFlow(DenseFlow):
 class _Recorder(MotionDetector):
     """The default detector. It stores the inputs of tracklet scores and accepts all blobs."""
 
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
+    def __init__(self, rate_hz: float) -> None:
+        super().__init__(backend="onboard", rate_hz=rate_hz)
         self.looks: dict[int, Look] = {}
 
     def _judge(self, index: int) -> list[Target]:
@@ -134,7 +134,7 @@ def record(case: tuple[Path, int]) -> Film:
     pictures = sorted((place / "frames").iterdir())[::every]
     note = place / "clip.json"
     rate_hz = json.loads(note.read_text()).get("rate", 10) if note.exists() else 10
-    detector = _Recorder(None, "onboard", rate_hz / every)
+    detector = _Recorder(rate_hz / every)
     images = [cv2.imread(str(path)) for path in pictures]
     scenes = [scene for image in images for scene in detector.update(image)] + detector.flush()
     repeats = {scene.frame.number - 1: scene.repeats - 1 for scene in scenes if scene.repeats}
