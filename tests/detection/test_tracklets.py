@@ -67,6 +67,17 @@ def test_people_who_go_further_than_their_own_size_between_looks_are_found():
     assert np.mean([len(scene.detections) for scene in scenes]) < 3.5
 
 
+def test_the_box_of_a_small_target_is_as_large_as_the_target():
+    """Erosion takes a pixel from each side of a candidate; the target gets it back."""
+    images, ground = [], draw_texture(3, HEIGHT + 80, WIDTH + 80) // 2
+    for k in range(12):
+        images.append(ground[2 * k : 2 * k + HEIGHT, 2 * k : 2 * k + WIDTH].copy())
+        images[-1][90:118, 60 + 13 * k : 80 + 13 * k] = 170
+    sizes = [scene.detections.box_px[:, 2:] for scene in detect_motion(images, backend="onboard")]
+    width, height = np.median(np.concatenate(sizes[2:-2]), axis=0)
+    assert width >= 20 and height >= 28
+
+
 def test_what_stands_still_and_what_flickers_is_no_target():
     rng = np.random.default_rng(1)
     spots = rng.uniform((30, 30), (300, 220), (20, 2))
