@@ -15,7 +15,7 @@ from torchvision_dddas.detection.interval import (
     look_cost,
     settings_at,
 )
-from torchvision_dddas.detection.person_scale import TINY, person_px
+from torchvision_dddas.detection.person_scale import TINY, person_px, score_size
 from torchvision_dddas.types import Flight
 
 PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
@@ -267,6 +267,33 @@ def down(altitude_m, pitch_deg=90.0):
 def test_a_person_covers_a_square_of_the_shoulders_from_above_and_of_more_of_the_body_aslant(flight, size_px):
     """0.5 m at 1000 px / 50 m. At 45 degrees the body shows 1.56 m by 0.5 m, from 71 m."""
     assert person_px(flight, 1000.0) == pytest.approx(size_px, abs=0.05)
+
+
+@pytest.mark.parametrize("pitch_deg", [90.0, 45.0, 30.0])
+def test_sizes_of_people_count_for_a_target_and_sizes_of_nothing_known_against_it(pitch_deg):
+    """At 1000 px a metre at 1 m; the boxes stand in the middle row and on rows above and below it."""
+    flight, sides = down(50, pitch_deg), np.array([0.3, 1.2, 1.8, 24.0]) * person_px(down(50, pitch_deg), 1000.0)
+    box = np.stack([0 * sides, 500 - sides, sides, sides], axis=1)
+    speck, person, group, wood = score_size(box, flight, 1000.0, 1000)
+    assert person == pytest.approx(1.0) and speck == pytest.approx(-1.0) and wood < -0.5
+    assert group < person
+    metre = 1000.0 / flight.distance_m
+    assert score_size(np.array([[0, 500 - 2 * metre, 4 * metre, 2 * metre]]), flight, 1000.0, 1000) == pytest.approx(0)
+
+
+def test_the_expected_size_of_a_person_shrinks_towards_the_horizon():
+    flight, side = down(50, 30), person_px(down(50, 30), 1000.0)
+    at_foot = np.array([[0, row - side, side, side] for row in (100.0, 500.0, 900.0)])
+    half, whole, double = at_foot * (1, 1, 0.5, 0.5), at_foot, at_foot * (1, 1, 2, 2)
+    score = [score_size(box, flight, 1000.0, 1000) for box in (half, whole, double)]
+    assert score[0].argmax() == 0, "far away, at the top of the picture, the small box fits best"
+    assert score[2].argmax() == 2, "near, at the bottom, the large one"
+
+
+def test_boxes_above_the_largest_size_are_no_targets_and_without_telemetry_no_size_counts():
+    base, boxes = with_parameters(Settings(), {"gates.focal_px": 1000.0}), np.array([[0, 0, 900.0, 900.0]])
+    assert settings_at(down(50), 10, base).score_sizes(boxes, 1000) == -np.inf
+    assert settings_at(None, 10, base).score_sizes(boxes, 1000) == 0
 
 
 def test_tiny_people_get_their_settings_until_the_vehicle_flies_lower_or_its_log_ends():

@@ -409,6 +409,7 @@ class MotionDetector:
             worth, close_px = BLOB_TINY, 0
         seen = {offset: there for offset, (there, _) in others.items()}
         scores = score_tracklets(candidates, tracklets, seen, hits=worth.hits)
+        scores += slot.distance.score_sizes(candidates.box_px, slot.view.size[1])
         chosen = choose(candidates, scores, settings.tracklets.accept, close_px, worth)
         return draw_chosen(observation, chosen, tracklets.velocity_px, scores, self._flow, settings)
 

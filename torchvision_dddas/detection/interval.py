@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.chain import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.config import IntervalParameters, Settings, is_set, is_tiny, uses_tracklets, with_parameters
-from torchvision_dddas.detection.person_scale import TINY, person_px, pixels_per_metre
+from torchvision_dddas.detection.person_scale import TINY, person_px, pixels_per_metre, score_size
 from torchvision_dddas.types import Adjustment, Flight, Telemetry
 
 WALKER_M_S = 1.4
@@ -179,6 +179,19 @@ class DistanceSettings:
     gates: Gates | None = None
     person_px: float = 0.0
     tiny: bool = False
+
+    def score_sizes(self, box_px: np.ndarray, height_px: int) -> np.ndarray:
+        """Return (N,) log odds of targets from the sizes of boxes (N, 4), -inf for boxes that are too large.
+
+        height_px: height of the picture. All values are 0 without telemetry.
+        """
+        if self.flight is None or self.gates is None:
+            return np.zeros(len(box_px))
+        scores, focal_px = np.zeros(len(box_px)), self.settings.gates.focal_px
+        if is_set(self.settings, "gates.focal_px") and not self.tiny:
+            scores = score_size(box_px, self.flight, focal_px, height_px)
+        scores[box_px[:, 2:].max(axis=1, initial=0) > self.gates.max_size_px] = -np.inf
+        return scores
 
     def values(self) -> dict[str, float]:
         """Return the current values by parameter name."""
