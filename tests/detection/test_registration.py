@@ -110,7 +110,7 @@ def test_one_background_motion_may_hold_for_a_quarter_of_the_keypoints_as_over_w
     """Of pictures that show different scenes, at most seven keypoints agree."""
     rng = np.random.default_rng(0)
     start = rng.uniform(0, 600, (120, 2))
-    end = start + (5, -3)
+    end = start + np.array([5, -3])
     end[agree:] += rng.uniform(10, 40, (120 - agree, 2))
     step = np.array([[1, 0, 5], [0, 1, -3], [0, 0, 1.0]])
     record, inliers = judge_points(step, start, end, (640, 640), parameters.Settings().registration)
