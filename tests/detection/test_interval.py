@@ -308,7 +308,7 @@ def test_tiny_people_get_their_settings_until_the_vehicle_flies_lower_or_its_log
     assert low.settings.difference == base.difference and low.settings.refine.on
     assert ("gates.tiny", 1, 0) in {(record.parameter, record.old, record.new) for record in records}
     after, _ = follow_distance(3, high, None, 10, base)
-    assert after == settings_at(None, 10, base) == DistanceSettings(base)
+    assert after == settings_at(None, 10, base) == DistanceSettings(with_parameters(base, {"small.on": False}))
 
 
 def test_a_pitch_that_changes_the_size_of_people_changes_the_settings_at_the_same_distance():
@@ -340,3 +340,11 @@ def test_patrol_is_the_default_with_a_size_of_people_for_clips_without_telemetry
     patrol = load_config("patrol")
     assert changes(patrol) == {"gates.person_px": 4.0}
     assert settings_at(None, 10, patrol).settings.difference.blur_px == TINY["difference.blur_px"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "on"),
+    [({}, False), ({"small.on": True}, True), ({"tracklets.on": False}, True), ({"gates.person_px": 12.0}, True)],
+)
+def test_tracklets_replace_the_search_for_small_targets_of_unknown_size(parameters, on):
+    assert settings_at(None, 10, with_parameters(Settings(), parameters)).settings.small.on == on
