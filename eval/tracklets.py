@@ -21,7 +21,6 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import MotionDetector
-from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, weigh
 from torchvision_dddas.detection.fragments import join_fragments
 from torchvision_dddas.detection.observation import Target, draw_chosen
@@ -90,17 +89,6 @@ class Film:
         return next((kind for part, kind in KINDS.items() if part in self.name), "other")
 
 
-class _WholeFlow(DenseFlow):
-    """The flow of a whole frame, computed once."""
-
-    flows: list[np.ndarray] | None = None
-
-    def __call__(self, grey: np.ndarray, others: Any, boxes: Any = None) -> list[np.ndarray]:
-        if self.flows is None:
-            self.flows = super().__call__(grey, others)
-        return self.flows
-
-
 class _Recorder(MotionDetector):
     """The default detector. It stores the inputs of tracklet scores and accepts all blobs."""
 
@@ -113,8 +101,8 @@ class _Recorder(MotionDetector):
         observation, candidates, settings = slot.observation, slot.observation.candidates, slot.distance.settings
         if candidates is None:
             return []
-        tracklets, flow = follow(candidates, self._looks_about(index), slot.view.size), _WholeFlow()
-        given = tracklets.velocity_px, np.zeros(len(candidates)), flow, settings
+        tracklets = follow(candidates, self._looks_about(index), slot.view.size)
+        given = tracklets.velocity_px, np.zeros(len(candidates)), settings
         drawn = [join_fragments(draw_chosen(observation, [i], *given)) for i in range(len(observation.blobs))]
         boxes = [_boxes([target.box for target in parts]) for parts in drawn]
         self.looks[slot.frame.number - 1] = Look(candidates, tracklets, boxes)

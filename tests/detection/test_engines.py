@@ -17,7 +17,6 @@ from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
 from torchvision_dddas import runtime
 from torchvision_dddas.detection import Engine, View, Window, load_engine
-from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.observation import observe
 from torchvision_dddas.detection.person_scale import TINY
 from torchvision_dddas.detection.torch_engine import TorchEngine
@@ -172,7 +171,7 @@ def test_a_window_is_searched_by_its_own_settings_beside_others_in_the_same_batc
         of_each = ((2, usual), (3, tiny), (4, usual))
         windows = [replace(window(views, steps, at, [(at - 1, at + 1)], False), settings=own) for at, own in of_each]
         maps = zip(windows, engine.foreground(windows), of_each, strict=True)
-        found.append([observe(window, shown, DenseFlow(), own).blobs for window, shown, (_, own) in maps])
+        found.append([observe(window, shown, own).blobs for window, shown, (_, own) in maps])
         cores = [engine.foreground([replace(windows[1], settings=own)])[0].core > 0 for own in (usual, tiny)]
         if engine.name == "onboard":
             assert cores[1].sum() > 1.2 * cores[0].sum()

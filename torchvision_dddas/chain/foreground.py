@@ -31,7 +31,7 @@ class Window(Generic[View]):
     """A reference frame and its neighbours in time. neighbour_from_reference: (K, 3, 3), or (B, K, 3, 3) for tensors.
 
     offsets: (K,) frames from the reference, negative = past. near: pairs of indices of neighbours whose evidence is
-    combined; the last pair is the widest and is used for dense flow. wide: a pair further apart, which fills the
+    combined; the last pair is the widest and is used for outlines. wide: a pair further apart, which fills the
     interior of large targets. small: a pair that shows small slow targets. close_px: side of the ellipse that closes
     gaps between fragments of a target; 0: the value in the settings. settings: settings for this frame; None: the
     engine's settings. ignored: mask of the reference's excluded pixels.

@@ -156,7 +156,10 @@ class RefineParameters(Group):
 class SmallParameters(Group):
     """Small slow targets: weak evidence over a longer gap, confirmed by steady travel."""
 
-    on: bool = parameter(True, "detect small slow targets while the interval is long enough")
+    on: bool = parameter(
+        True,
+        "detect small slow targets while the interval is long enough; beside tracklets only if set, or with telemetry",
+    )
     from_interval: int = parameter(3, "shortest interval at which small targets are detected", "frames", 1, 60)
     gap_frames: int = parameter(6, "distance to the neighbours on both sides, at most the interval", "frames", 1, 30)
     gap_move_px: float = parameter(
@@ -182,7 +185,7 @@ class SmallParameters(Group):
 class HistoryParameters(Group):
     """The motion history, its gradient and the segmentation by motion (appendix B, step S5)."""
 
-    on: bool = parameter(True, "motion history: heading and speed without flow, and splits of touching targets")
+    on: bool = parameter(True, "motion history: heading, speed and splits of touching targets without tracklets")
     duration_frames: float = parameter(6.0, "time for which a silhouette stays in the history", "frames", 1, 120)
     delta_min_frames: float = parameter(0.5, "smallest difference of time stamps with a gradient", "frames", 0, 60)
     delta_max_frames: float = parameter(4.0, "largest difference of time stamps with a gradient", "frames", 0, 120)

@@ -11,7 +11,6 @@ import numpy as np
 
 from torchvision_dddas.chain import View, Window, near_gaps
 from torchvision_dddas.config import Settings, check_settings, uses_tracklets
-from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.candidates import Candidates
 from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.detection.fragments import Ground, join_fragments
@@ -165,7 +164,6 @@ class MotionDetector:
         self._held: tuple[Adjustment, ...] = ()  # adjustments that came with repeated frames
         self._ended = False
         self._mask: tuple[str, np.ndarray | None] | None = None
-        self._flow = DenseFlow()
         self._small_tracks = SmallTracks(self.settings.small, uses_tracklets(self.settings))
         self._history = MotionHistory(self.settings.history.duration_frames)
 
@@ -335,7 +333,7 @@ class MotionDetector:
                 for i in range(max(self._remembered, self._buffer.first), index + 1):
                     history.move(self._buffer[i].look, self._buffer.this_from_last(i))
                 self._remembered = index + 1
-            slot.observation = observe(window, foreground, self._flow, slot.distance.settings, history)
+            slot.observation = observe(window, foreground, slot.distance.settings, history)
             slot.seconds |= {"foreground": seconds, "blobs": time.perf_counter() - start}
 
     def _build_window(self, index: int) -> Window | None:
@@ -400,8 +398,7 @@ class MotionDetector:
         slot = self._buffer[index]
         observation, settings, candidates = slot.observation, slot.distance.settings, slot.observation.candidates
         if candidates is None:
-            drawn = draw_blobs(observation, observation.blobs, observation.motions, settings)
-            return [target for parts in drawn for target in parts]
+            return draw_blobs(observation, observation.blobs, observation.velocities_px, settings)
         others = self._looks_about(index)
         tracklets = follow(candidates, others, slot.view.size)
         worth, close_px = BLOB_SIZED if slot.distance.person_px else BLOB, settings.morphology.close_px
@@ -411,7 +408,7 @@ class MotionDetector:
         scores = score_tracklets(candidates, tracklets, seen, hits=worth.hits)
         scores += slot.distance.score_sizes(candidates.box_px, slot.view.size[1])
         chosen = choose(candidates, scores, settings.tracklets.accept, close_px, worth)
-        return draw_chosen(observation, chosen, tracklets.velocity_px, scores, self._flow, settings)
+        return draw_chosen(observation, chosen, tracklets.velocity_px, scores, settings)
 
     def _looks_about(self, index: int) -> dict[int, tuple[Candidates, np.ndarray]]:
         """Return the looks that a frame's tracklets may use: by offset, candidates and the homography to the frame."""

@@ -21,7 +21,7 @@ class Foreground(Maps[np.ndarray]):
     offsets: frame offsets of the `warped` neighbours from the reference frame. scale: side of a map pixel in frame
     pixels; above 1 only if the maps serve for blobs alone. blobs: set if the engine itself finds the blobs. Then
     evidence, wide and texture are filled only inside the blobs' boxes, `core` only if a motion history needs it, and
-    `warped` only if flow needs it; all are 0 elsewhere.
+    `warped` only if outlines need it; all are 0 elsewhere.
     """
 
     offsets: tuple[int, int] = (0, 0)

@@ -1,7 +1,7 @@
 """Turn the foreground of one window into targets: find blobs or candidates, measure their motion, draw their masks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -9,7 +9,6 @@ import numpy as np
 
 from torchvision_dddas.chain import View, Window, evidence_scale
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings, uses_tracklets
-from torchvision_dddas.detection.blob_motion import BlobMotion, DenseFlow, measure_motions, split_by_flow
 from torchvision_dddas.detection.blobs import (
     Blob,
     Box,
@@ -48,30 +47,27 @@ class Target:
 class Observation:
     """The measurements of one frame, from which its targets are chosen.
 
-    window, foreground: dropped once the targets are drawn. candidates: set only if targets are judged by tracklets.
+    window, foreground: dropped once the targets are drawn. velocities_px: (2,) pixels a frame for each blob, unless
+    targets are judged by tracklets. candidates: set only if they are.
     """
 
     window: Window[View] | None = None
     foreground: Foreground | None = None
     blobs: list[Blob] = field(default_factory=list)
-    motions: list[BlobMotion] = field(default_factory=list)
+    velocities_px: list[np.ndarray] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)
     candidates: Candidates | None = None
 
 
 def observe(
-    window: Window[View],
-    foreground: Foreground,
-    flow: DenseFlow,
-    settings: Settings,
-    history: MotionHistory | None = None,
+    window: Window[View], foreground: Foreground, settings: Settings, history: MotionHistory | None = None
 ) -> Observation:
     """Find the blobs of a window's reference frame and their motions, or, with tracklets, its blobs and candidates.
 
-    history: the motion history, already aligned to this frame. It gives the motion if dense flow is off.
+    history: the motion history, already aligned to this frame. It gives the motion of blobs.
     """
     view = window.reference
-    if uses_tracklets(settings):  # motion is measured later, for the chosen blobs only
+    if uses_tracklets(settings):
         blobs = _find_blobs(foreground, settings)
         blobs = sorted(blobs, key=lambda blob: -blob.area_px)[
             :_MOST_BLOBS
@@ -79,28 +75,11 @@ def observe(
         candidates = find_candidates(_evidence_by_gap(window, foreground), view.grey, blobs)
         return Observation(window, foreground, blobs, candidates=candidates)
     blobs = _find_blobs(foreground, settings) if foreground.blobs is None else foreground.blobs
-    motions: list[BlobMotion] = []
-    if blobs and settings.refine.on:
-        blobs, motions = measure_blobs(blobs, view, foreground, flow, settings)
-    elif history is not None:
+    ways = [(blob, np.full(2, np.nan)) for blob in blobs]
+    if history is not None:
         history.add(foreground.core)
         ways = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
-        blobs, motions = [blob for blob, _ in ways], [BlobMotion(velocity_px) for _, velocity_px in ways]
-    return Observation(window, foreground, blobs, motions)
-
-
-def measure_blobs(
-    blobs: list[Blob], view: View, foreground: Foreground, flow: DenseFlow, settings: Settings
-) -> tuple[list[Blob], list[BlobMotion]]:
-    """Return the blobs of a view and their motions by dense flow. If history is on, split blobs with two motions."""
-    flows = flow(view.grey, foreground.warped, [blob.box for blob in blobs])
-    motions = measure_motions(blobs, flows, foreground.offsets)
-    if settings.history.on:
-        parts = [split_by_flow(*both, flows, foreground.offsets) for both in zip(blobs, motions, strict=True)]
-        if any(len(two) > 1 for two in parts):
-            blobs = [part for two in parts for part in two]
-            motions = measure_motions(blobs, flows, foreground.offsets)
-    return blobs, motions
+    return Observation(window, foreground, [blob for blob, _ in ways], [velocity_px for _, velocity_px in ways])
 
 
 def _evidence_by_gap(window: Window[View], foreground: Foreground, place: Any = np.s_[:]) -> Evidence:
@@ -121,50 +100,34 @@ def _find_blobs(foreground: Foreground, settings: Settings) -> list[Blob]:
 
 
 def draw_blobs(
-    here: Observation, blobs: list[Blob], motions: Sequence[BlobMotion], settings: Settings
-) -> list[list[Target]]:
-    """Return a list of targets for each blob of a frame, with refined outlines. A blob may give several targets."""
+    here: Observation, blobs: list[Blob], velocities_px: Sequence[np.ndarray], settings: Settings
+) -> list[Target]:
+    """Return the targets of blobs, with refined outlines. velocities_px: (2,) pixels a frame for each blob."""
     window, foreground = here.window, here.foreground
     if window is None or foreground is None:
         return []
-    view, is_refined = window.reference, bool(motions) and settings.refine.on
-    refined = refine_outlines(list(zip(blobs, motions, strict=True)), view, foreground, settings) if is_refined else []
-    drawn: list[list[Target]] = []
-    for i, blob in enumerate(blobs):
-        velocity_px = motions[i].velocity_px if motions else np.full(2, np.nan)
-        mask = _without_shadow(refined[i], blob.box, blob.area_px, window, settings) if is_refined else blob.mask
+    masks = [blob.mask for blob in blobs]
+    if settings.refine.on:
+        masks = refine_outlines(blobs, velocities_px, window.reference, foreground, settings)
+    targets: list[Target] = []
+    for blob, velocity_px, mask in zip(blobs, velocities_px, masks, strict=True):
+        if settings.refine.on:
+            mask = _without_shadow(mask, blob.box, blob.area_px, window, settings)
         # The score is a confidence in [0, 1) that grows with the ratio of the peak evidence to the threshold.
         score = float(1 - np.exp(-blob.peak / (2 * settings.difference.threshold * evidence_scale(settings))))
-        drawn.append([])
         for box, part in connected_parts(mask, blob.box, settings.gates.min_area_px // 2):
             core = blob.core[box_slices(box, *blob.box[:2])] & part
-            drawn[-1].append(Target(box, part, velocity_px, score, core))
-    return drawn
+            targets.append(Target(box, part, velocity_px, score, core))
+    return targets
 
 
 def draw_chosen(
-    here: Observation,
-    chosen: Sequence[int],
-    velocity_px: np.ndarray,
-    scores: np.ndarray,
-    flow: DenseFlow,
-    settings: Settings,
+    here: Observation, chosen: Sequence[int], velocity_px: np.ndarray, scores: np.ndarray, settings: Settings
 ) -> list[Target]:
-    """Return the targets of the chosen candidates, and measure the motion of the blobs among them.
-
-    velocity_px, scores: (N, 2) and (N,) of all candidates' tracklets.
-    """
-    window, foreground, count = here.window, here.foreground, len(here.blobs)
-    blobs = [here.blobs[i] for i in chosen if i < count]
-    motions = [BlobMotion(velocity_px[i]) for i in chosen if i < count]
-    ways = {id(blob): motion.velocity_px for blob, motion in zip(blobs, motions, strict=True)}
-    if blobs and settings.refine.on and window is not None and foreground is not None:
-        blobs, motions = measure_blobs(blobs, window.reference, foreground, flow, settings)
-    targets = []
-    for blob, parts in zip(blobs, draw_blobs(here, blobs, motions, settings), strict=True):
-        # Use the tracklet's velocity: flow underestimates the motion of a uniform body.
-        way = ways.get(id(blob)) if len(parts) == 1 else None
-        targets += parts if way is None else [replace(parts[0], velocity_px=way)]
+    """Return the targets of chosen candidates. velocity_px, scores: (N, 2) and (N,) of all candidates' tracklets."""
+    count = len(here.blobs)
+    blobs = [i for i in chosen if i < count]
+    targets = draw_blobs(here, [here.blobs[i] for i in blobs], velocity_px[blobs], settings)
     for i in chosen:
         if i >= count:
             confidence = float(1 / (1 + np.exp(-scores[i])))

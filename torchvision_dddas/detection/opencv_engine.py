@@ -117,10 +117,12 @@ class OpenCVEngine(Engine[OpenCVView]):
             return [find_foreground(window, own) for window, own in zip(windows, given, strict=True)]
         halves = [(halve_window(window), halve_settings(own)) for window, own in zip(windows, given, strict=True)]
         found = [find_foreground(*half) for half in halves]
-        flow = settings.refine.on
-        if not (flow or settings.history.on or settings.small.on):  # finding blobs does not need the whole resolution
+        outlines = settings.refine.on
+        if not (
+            outlines or settings.history.on or settings.small.on
+        ):  # finding blobs does not need the whole resolution
             return [replace(half, scale=2) for half in found]
-        return [double_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
+        return [double_maps(half, window.reference.size, outlines) for half, window in zip(found, windows, strict=True)]
 
 
 def find_foreground(window: Window[OpenCVView], settings: Settings) -> Foreground:
@@ -164,8 +166,8 @@ def halve_settings(settings: Settings) -> Settings:
     )
 
 
-def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foreground:
-    """Enlarge the maps of half pictures to size (width, height). flow: whether the warped pictures are needed."""
+def double_maps(half: Foreground, size: tuple[int, int], outlines: bool) -> Foreground:
+    """Enlarge the maps of half pictures to size (width, height). outlines: whether the warped pictures are needed."""
     is_needed = half.texture.strides != (0, 0)
     texture = double(cv2.convertScaleAbs(half.texture, alpha=0.5), size) if is_needed else no_texture(size[::-1])
     evidence = double(half.evidence, size)
@@ -176,7 +178,7 @@ def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foregrou
         evidence if half.wide is half.evidence else double(half.wide, size),
         texture,
         None if half.small is None else double(half.small, size),
-        (double(one, size, smooth=True), double(other, size, smooth=True)) if flow else half.warped,
+        (double(one, size, smooth=True), double(other, size, smooth=True)) if outlines else half.warped,
         tuple(double(pair, size) for pair in half.pairs),
         None if half.levels is None else double(half.levels, size),
         half.offsets,

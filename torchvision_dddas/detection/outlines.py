@@ -12,7 +12,6 @@ import numpy as np
 
 from torchvision_dddas.chain import View, ellipse
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings
-from torchvision_dddas.detection.blob_motion import BlobMotion
 from torchvision_dddas.detection.blobs import Blob, Box, box_slices
 from torchvision_dddas.detection.engine import Foreground
 
@@ -38,25 +37,28 @@ _CRUMB = 0.15
 
 
 def refine_outlines(
-    moving: Sequence[tuple[Blob, BlobMotion]], view: View, foreground: Foreground, settings: Settings
+    blobs: Sequence[Blob], velocities_px: Sequence[np.ndarray], view: View, foreground: Foreground, settings: Settings
 ) -> list[np.ndarray]:
     """Return the refined masks inside the blobs' boxes, (height, width) bool. They are subsets of the blobs' masks.
 
-    view: the reference frame. foreground: its maps; `BlobMotion.affine` is the motion to its warped neighbours.
+    velocities_px: (2,) pixels a frame over the background for each blob; unknown (NaN) velocities count as 0. view: the
+    reference frame. foreground: its maps.
     """
     seeds, guides = [], []
-    for blob, motion in moving:
+    for blob, velocity_px in zip(blobs, velocities_px, strict=True):
         left, top, width, height = _surroundings(blob.box, view.size)
         here: np.ndarray = np.zeros((height, width, 2), np.float32)
         here[..., 1] = 1
-        here[box_slices(blob.box, left, top)] = np.dstack(_explain_pixels(blob, motion, view, foreground, settings))
+        here[box_slices(blob.box, left, top)] = np.dstack(
+            _explain_pixels(blob, velocity_px, view, foreground, settings)
+        )
         half = max(width // 2, 1), max(height // 2, 1)
         image = view.image[box_slices((left, top, width, height))]
         guides.append(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
         seeds.append(cv2.resize(here, half, interpolation=cv2.INTER_AREA))
     weights = smooth_along_edges(seeds, guides, settings.refine.spatial_px / 2, settings.refine.colour_levels)
     masks = []
-    for (blob, _), weight in zip(moving, weights, strict=True):
+    for blob, weight in zip(blobs, weights, strict=True):
         left, top, width, height = _surroundings(blob.box, view.size)
         share = cv2.resize(weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6), (width, height))
         masks.append((share[box_slices(blob.box, left, top)] > settings.refine.share) & blob.mask)
@@ -71,7 +73,7 @@ def _surroundings(box: Box, size: tuple[int, int]) -> Box:
 
 
 def _explain_pixels(
-    blob: Blob, motion: BlobMotion, view: View, foreground: Foreground, settings: Settings
+    blob: Blob, velocity_px: np.ndarray, view: View, foreground: Foreground, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how certainly each pixel of a blob's box is target, and background: (height, width) float32 each."""
     x, y, width, height = blob.box
@@ -87,15 +89,10 @@ def _explain_pixels(
         return cv2.blur(cv2.threshold(miss, _MAX_MISFIT, 0, cv2.THRESH_TRUNC)[1], (3, 3))
 
     still = misfit([picture[box] for picture in foreground.warped])
-    # Warp the neighbours into the blob's box by the target's motion.
-    centre_u, centre_v, scale = motion.frame
+    # Shift the neighbours into the blob's box by the target's motion.
     moved = []
-    for picture, (shift, by_u, by_v) in zip(foreground.warped, motion.affine, strict=True):
-        # u + shift + by_u (u - cu) / s + by_v (v - cv) / s, with (u, v) counted from the box's corner
-        slopes = np.stack([by_u, by_v], axis=1)
-        matrix = np.empty((2, 3))
-        matrix[:, :2] = np.eye(2) + slopes / scale
-        matrix[:, 2] = np.array([x, y]) + shift + slopes @ np.array([x - centre_u, y - centre_v]) / scale
+    for picture, offset in zip(foreground.warped, foreground.offsets, strict=True):
+        matrix = np.c_[np.eye(2), (x, y) + offset * np.nan_to_num(velocity_px)]
         moved.append(
             cv2.warpAffine(picture, matrix, (width, height), flags=WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
         )

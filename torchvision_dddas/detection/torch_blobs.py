@@ -2,7 +2,7 @@
 
 Kornia's union-find labels the regions of all pictures of a batch at once; scatter operations give their area, peak and
 box. These numbers are copied to the host and gated there. Then one transfer copies all needed pixels: the crops of the
-blobs' boxes, and the warped neighbours of frames with blobs for dense flow.
+blobs' boxes, and the warped neighbours of frames with blobs for outlines.
 """
 
 from collections.abc import Sequence
@@ -78,16 +78,16 @@ def foregrounds_with_blobs(
     parts = parts.at(np.flatnonzero((parts.area_px >= least_px) & (parts.peak >= least)))
     asked = _cut_regions(parts, near) + _cut_boxes(parts, [near, wide, texture])[0]
     shown = np.unique(parts.picture)
-    for_flow = bool(len(shown)) and settings.refine.on
-    for_history = settings.history.on and not settings.refine.on
-    if for_flow:
+    for_outlines = bool(len(shown)) and settings.refine.on
+    for_history = settings.history.on
+    if for_outlines:
         asked += [picture[torch.from_numpy(shown).to(picture.device), 0] for picture in warped]
     asked += [picture[:, 0] for picture in ([core] if for_history else []) + ([] if small is None else [small])]
     arrived = iter(_fetch(asked))
     crops = [next(arrived) for _ in range(5)]
     nothing = np.zeros(core.shape[-2:], np.uint8)
     others = {}
-    if for_flow:
+    if for_outlines:
         others = dict(zip(shown.tolist(), zip(next(arrived), next(arrived), strict=True), strict=True))
     cores = next(arrived) if for_history else [nothing] * len(windows)
     smalls = [None] * len(windows) if small is None else list(next(arrived))
