@@ -15,6 +15,7 @@ blobs, their motion, tracklets and outlines are computed after it (`detection`).
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
+from itertools import islice
 from typing import Any, Generic
 
 from torchvision_dddas.chain.operations import Number, Operations, Picture, Seen, View
@@ -113,7 +114,9 @@ class DetectionChain(Generic[View, Picture, Seen]):
         """Run all steps of the chain on a window, and return its maps."""
         neighbours = self.neighbours(window)
         reference = neighbours.reference()
-        pairs = tuple(self.find_evidences(map(neighbours.compared_and_seen, window.near), reference))
+        compared = window.near if window.wide is None else (*window.near, window.wide)
+        evidences = self.find_evidences(map(neighbours.compared_and_seen, compared), reference)
+        pairs = tuple(islice(evidences, len(window.near)))
         near = reduce(self.operations.larger, pairs)
         one, other = window.near[-1]
         warped = neighbours.warped(one), neighbours.warped(other)
@@ -121,7 +124,7 @@ class DetectionChain(Generic[View, Picture, Seen]):
         neighbours.keep_for(window.wide, window.small)
         wide = near
         if window.wide is not None:
-            (wide,) = self.find_evidences([neighbours.compared_and_seen(window.wide)], reference)
+            (wide,) = evidences
             if levels is not None:
                 levels = self.operations.larger(levels, self.find_levels(neighbours, window.wide))
         neighbours.keep_for(window.small)
