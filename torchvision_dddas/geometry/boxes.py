@@ -54,11 +54,15 @@ def occupied(mask: np.ndarray, apart: int) -> list[Box]:
     """
     height, width = mask.shape
     block = _BLOCK_PX
-    padded = cv2.copyMakeBorder(mask, 0, -height % block, 0, -width % block, cv2.BORDER_CONSTANT, value=0)
-    blocks = cv2.resize(padded, (padded.shape[1] // block, padded.shape[0] // block), interpolation=cv2.INTER_AREA)
+    whole = height // block * block
+    # Take the maximum down the columns first, because that reads whole rows of memory.
+    rows = mask[:whole].reshape(-1, block, width).max(axis=1)
+    if whole < height:
+        rows = np.concatenate([rows, mask[whole:].max(axis=0, keepdims=True)])
+    blocks = np.maximum.reduceat(rows, np.arange(0, width, block), axis=1)
     reach = -(-apart // (2 * block))
     blocks = cv2.dilate(blocks, np.ones((2 * reach + 1,) * 2, np.uint8))
-    count, _, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(blocks, 0, 255, cv2.THRESH_BINARY)[1])
+    count, _, stats, _ = cv2.connectedComponentsWithStats(blocks)
     waiting: list[Box] = [(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()]
     # Join overlapping boxes (left, top, right, bottom) until all boxes are disjoint.
     apart_boxes: list[Box] = []
