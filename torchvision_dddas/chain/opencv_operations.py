@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas.chain.exposure import View, exposure_between
 from torchvision_dddas.chain.operations import Operations
 from torchvision_dddas.config import WHITE, exposure_step
-from torchvision_dddas.geometry import occupied, transfer
+from torchvision_dddas.geometry import occupied
 
 # Inside a tile an affine map may replace a homography if they differ by at most this, px. OpenCV's own warps round
 # positions to 1/32 px.
@@ -198,11 +198,11 @@ def find_seen(picture_from_reference: np.ndarray, size: tuple[int, int], border:
     mask = np.zeros((height, width), np.uint8)
     if border > min(right, bottom):
         return mask
-    corners = np.array([(border, border), (right, border), (right, bottom), (border, bottom)], float)
+    corners = np.array([(border, right, right, border), (border, border, bottom, bottom), (1, 1, 1, 1)], float)
     reference_from_picture = np.linalg.inv(picture_from_reference)
-    depth = np.c_[corners, np.ones(4)] @ (reference_from_picture / reference_from_picture[2, 2])[2]
-    if (depth > 0.1).all():
-        outline = transfer(reference_from_picture, corners)
+    away = reference_from_picture @ corners
+    if (away[2] / reference_from_picture[2, 2] > 0.1).all():
+        outline = away[:2].T / away[2, :, None]
         cv2.fillConvexPoly(mask, np.round(16 * outline).astype(np.int32), 255, shift=4)
         return mask
     mask[border : bottom + 1, border : right + 1] = 255
