@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import MotionDetector
-from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, weigh
+from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, SILHOUETTES, Candidates, describe_look, weigh
 from torchvision_dddas.detection.fragments import join_fragments
 from torchvision_dddas.detection.observation import Target, draw_chosen
 from torchvision_dddas.detection.tracklet_scores import (
@@ -272,12 +272,18 @@ def detect(film: Film, weights: Weights | None, accept: float = 0.0, worth: Wort
             candidates = seen.pop(0)
             scores = score_tracklets(candidates, look.tracklets, seen, weights[1])
             chosen = choose(candidates, scores, accept, SETTINGS.morphology.close_px, worth)
-        boxes = [look.drawn[i] if i < len(look.drawn) else look.candidates.box_px[i : i + 1] for i in chosen]
+        boxes = [look.drawn[i] if i < len(look.drawn) else _widened(look.candidates, i) for i in chosen]
         small = look.small
         if len(small) and boxes:
             small = small[~_holds(np.concatenate(boxes), small[:, :2] + small[:, 2:] / 2).any(axis=0)]
         found.append(np.concatenate([*boxes, small]))
     return found
+
+
+def _widened(candidates: Candidates, index: int) -> np.ndarray:
+    """Return the (1, 4) box of a candidate with the pixels that erosion took from its sides, as the detector does."""
+    margin = SILHOUETTES[candidates.silhouette[index]].erode_px // 2
+    return candidates.box_px[index : index + 1] + np.array([-margin, -margin, 2 * margin, 2 * margin])
 
 
 def score(film: Film, found: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

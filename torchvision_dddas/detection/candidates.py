@@ -52,13 +52,13 @@ SILHOUETTES = (
     Silhouette((LEVELS,), 5.0, 3, 25),
 )
 LOOK_WEIGHTS = {
-    "peak2": 0.918,
-    "around": 3.408,
-    "around2": -2.63,
-    "size": 1.175,
-    "size2": -0.09,
-    "levels_over_around": 1.74,
-    "constant": -12.689,
+    "peak2": 0.811,
+    "around": 3.452,
+    "around2": -2.677,
+    "size": 1.197,
+    "size2": -0.096,
+    "levels_over_around": 1.716,
+    "constant": -11.933,
 }
 """Weights of the features that `describe_look` computes."""
 

@@ -14,14 +14,14 @@ from torchvision_dddas.detection.tracklets import Tracklets
 from torchvision_dddas.geometry import shared_px
 
 TRACKLET_WEIGHTS = {
-    "own": 0.259,
-    "mean": 0.946,
-    "travel_px": 0.655,
-    "sureness": -0.301,
-    "stays": -1.216,
-    "growth_y": -0.892,
-    "slender": 1.007,
-    "constant": -1.27,
+    "own": 0.277,
+    "mean": 0.928,
+    "travel_px": 0.686,
+    "sureness": -0.307,
+    "stays": -0.853,
+    "growth_y": -0.898,
+    "slender": 1.011,
+    "constant": -1.369,
 }
 """Weights of the features that `describe_tracklets` computes."""
 
@@ -39,7 +39,7 @@ class Worth(NamedTuple):
     hits: int = 2
 
 
-BLOB = Worth(2.0, 3.0)
+BLOB = Worth(2.5, 3.0)
 """The bonus without telemetry, chosen by `python eval/tracklets.py learn DATA --blob 1 2 3`."""
 BLOB_SIZED = Worth(4.0, 4.0, hits=4)
 """The bonus with telemetry, which shows whether a blob has the size and the speed of a target."""
