@@ -171,8 +171,9 @@ def test_closing_in_metres_is_bounded_by_the_pixels():
     assert settings_at(Flight(200.0), 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
 
 
-def test_where_no_speed_is_computed_its_gate_is_not_set():
-    fast = load_config("fast")
+@pytest.mark.parametrize("refine", ["refine.on=false", "refine.on=true"])
+def test_where_no_speed_is_computed_its_gate_is_not_set(refine):
+    fast = load_config("fast", [refine])
     _, records = follow_distance(1, DistanceSettings(fast), Flight(100.0), 10, fast)
     assert {"gates.max_size_px"} <= (changed := {record.parameter for record in records})
     assert "gates.max_speed_px" not in changed

@@ -267,7 +267,7 @@ def settings_at(flight: Flight | None, rate_hz: float, base: Settings) -> Distan
         "small.gap_frames": gap,
         "morphology.close_px": close_px,
     }
-    has_speed = base.history.on or uses_tracklets(base) or base.refine.on or base.small.on
+    has_speed = base.history.on or uses_tracklets(base) or base.small.on
     max_speed = gates.max_speed_m_s * scale / rate_hz if has_speed else float("inf")
     bounds = Gates(gates.min_size_m * scale, gates.max_size_m * scale, max_speed)
     return DistanceSettings(with_parameters(base, chosen), flight, bounds, size_px, tiny)
