@@ -291,6 +291,13 @@ def test_the_expected_size_of_a_person_shrinks_towards_the_horizon():
     assert score[2].argmax() == 2, "near, at the bottom, the large one"
 
 
+@pytest.mark.parametrize("pitch_deg", [-90.0, -20.0, 0.0, 95.0, 150.0, 180.0, float("nan")])
+def test_sizes_have_a_finite_score_at_any_pitch_of_the_camera(pitch_deg):
+    box = np.array([[0, 0, 10, 10], [0, 400, 20, 40], [0, 470, 10, 10.0]])
+    flight = Flight(30.0, pitch_rad=np.radians(pitch_deg))
+    assert np.isfinite(score_size(box, flight, 400.0, 480)).all()
+
+
 def test_boxes_above_the_largest_size_are_no_targets_and_without_telemetry_no_size_counts():
     base, boxes = with_parameters(Settings(), {"gates.focal_px": 1000.0}), np.array([[0, 0, 900.0, 900.0]])
     assert settings_at(down(50), 10, base).score_sizes(boxes, 1000) == -np.inf

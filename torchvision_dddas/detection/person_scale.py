@@ -18,7 +18,8 @@ _SIDE_SPREAD, _MISFIT = 0.3, 2.0
 # Log odds of a person's size. A vehicle's size counts 0, because large boxes also show groups of people, trees and
 # buildings. Thermal clips alone would give 1.5 to 2, simulated flights 0.8 to 1.
 _FIT = 1.0
-_LEAST_BELOW_RAD = 0.1  # ground nearer to the horizon is too far to tell
+# Ground nearer to the horizon, before or behind the camera, is too far to tell.
+_LEAST_BELOW_RAD = 0.1
 
 TINY: dict[str, object] = {
     # People are as small as the texture of the ground, so no kernel may be wider than a person.
@@ -58,7 +59,7 @@ def score_size(box_px: np.ndarray, flight: Flight, focal_px: float, height_px: i
     """
     pitch = flight.pitch_rad if math.isfinite(flight.pitch_rad) else math.pi / 2
     below_axis = np.arctan((box_px[:, 1] + box_px[:, 3] - height_px / 2) / focal_px)
-    below_horizon = np.maximum(pitch + below_axis, _LEAST_BELOW_RAD)
+    below_horizon = np.clip(pitch + below_axis, _LEAST_BELOW_RAD, math.pi - _LEAST_BELOW_RAD)
     metre = focal_px * np.sin(below_horizon) / (max(flight.altitude_m, 1.0) * np.cos(below_axis))
     body = metre * np.sqrt(_seen_length(below_horizon) * BODY_M[1])
     side = np.sqrt(box_px[:, 2] * box_px[:, 3])
