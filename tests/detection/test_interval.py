@@ -352,7 +352,13 @@ def test_patrol_is_the_default_with_a_size_of_people_for_clips_without_telemetry
 
 @pytest.mark.parametrize(
     ("parameters", "on"),
-    [({}, False), ({"small.on": True}, True), ({"tracklets.on": False}, True), ({"gates.person_px": 12.0}, True)],
+    [
+        ({}, False),
+        ({"small.on": True}, True),
+        ({"small.hits": 5}, True),
+        ({"tracklets.on": False}, True),
+        ({"gates.person_px": 12.0}, True),
+    ],
 )
 def test_tracklets_replace_the_search_for_small_targets_of_unknown_size(parameters, on):
     assert settings_at(None, 10, with_parameters(Settings(), parameters)).settings.small.on == on

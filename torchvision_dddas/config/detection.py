@@ -161,7 +161,8 @@ class SmallParameters(Group):
 
     on: bool = parameter(
         True,
-        "detect small slow targets while the interval is long enough; beside tracklets only if set, or with telemetry",
+        "detect small slow targets while the interval is long enough; beside tracklets only with telemetry or "
+        "gates.person_px, or if a parameter of small is set",
     )
     from_interval: int = parameter(3, "shortest interval at which small targets are detected", "frames", 1, 60)
     gap_frames: int = parameter(6, "distance to the neighbours on both sides, at most the interval", "frames", 1, 30)

@@ -237,8 +237,8 @@ def settings_at(flight: Flight | None, rate_hz: float, base: Settings) -> Distan
     - The smallest area is expected_share x e^2, limited to the range from small.min_area_px to the user's min_area_px.
     - The search for small targets is on while a person's area (e^2 if unknown) is at most small.max_box_px. It compares
       frames between which a walker moves by gap_move_px (ours). Without a known size, tracklets replace the search
-      unless the user has set small.on: on the open clips the search adds no hit to theirs, and takes a seventh of the
-      time.
+      unless the user has set a parameter of `small`: on the open clips the search adds no hit to theirs, and takes a
+      seventh of the time.
     - If close_m is set, closing bridges gaps of close_m, at most close_px, so that it joins no more from higher up.
     - If people are tiny, parameters that the user has not set take their values from TINY (ours).
     """
@@ -249,7 +249,7 @@ def settings_at(flight: Flight | None, rate_hz: float, base: Settings) -> Distan
     if tiny:
         base = with_parameters(base, {name: value for name, value in TINY.items() if not is_set(base, name)})
     if flight is None:
-        if not size_px and uses_tracklets(base) and not is_set(base, "small.on"):
+        if not size_px and uses_tracklets(base) and not base.small.model_fields_set:
             base = with_parameters(base, {"small.on": False})
         return DistanceSettings(base, person_px=size_px, tiny=tiny)
     gates, small, gap, close_px = base.gates, base.small, base.small.gap_frames, base.morphology.close_px
