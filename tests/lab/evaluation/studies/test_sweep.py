@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from torchvision_dddas.config import Settings, load_config, with_parameters
+from torchvision_dddas.config import Settings, is_set, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.studies import sweep
 from torchvision_dddas.lab.evaluation.studies.sweep import ParameterAxis, Trial, best, parse_grid, parse_ranges
@@ -119,10 +119,16 @@ def test_proposals_keep_to_whole_and_odd_numbers_and_named_values_and_survive_fa
 
 
 def test_the_best_is_written_so_that_it_is_read_as_the_same_settings(tmp_path) -> None:
-    parameters = {"difference.near_frames": (1, 3), "difference.threshold": 0.1 + 0.2, "refine.on": False}
+    parameters = {
+        "difference.near_frames": (1, 3),
+        "difference.threshold": 0.1 + 0.2,
+        "refine.on": False,
+        "small.on": True,
+    }
     wanted = with_parameters(load_config("fast"), {**parameters, "people.graphs": "\U0001f600"})
     (tmp_path / "best.toml").write_text(sweep.settings_toml(wanted, ["a line", "another"]), encoding="utf-8")
     assert load_config(tmp_path / "best.toml") == wanted
+    assert is_set(load_config(tmp_path / "best.toml"), "small.on"), "set to its default, which tracklets replace"
     words = [f"{name}={sweep.toml_value(value)}" for name, value in parameters.items()]
     assert load_config("fast", words) == with_parameters(load_config("fast"), parameters)
 

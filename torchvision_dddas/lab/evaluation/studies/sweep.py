@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, nearest, with_parameters
+from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, is_set, nearest, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.lab.evaluation.report.sweep import save_sweep
@@ -404,11 +404,12 @@ class SweepRecord:
 
 
 def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
-    """Return the settings that differ from the defaults, as `--config` reads them, below some lines of comment."""
+    """Return the settings that are set, even to their defaults, as `--config` reads them, below lines of comment."""
     groups: dict[str, dict[str, object]] = {}
-    for name, value in changes(settings).items():
-        group, parameter = name.split(".")
-        groups.setdefault(group, {})[parameter] = value
+    for known in all_parameters():
+        if is_set(settings, known.name):
+            group, parameter = known.name.split(".")
+            groups.setdefault(group, {})[parameter] = getattr(getattr(settings, group), parameter)
     return format_toml(groups, heading)
 
 
