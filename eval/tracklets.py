@@ -55,13 +55,12 @@ Weights = tuple[dict[str, float], dict[str, float]]
 class Look:
     """Inputs of the detector's decision on a look.
 
-    drawn: (N, 4) boxes of the blobs' refined outlines. small: boxes of small tracks.
+    drawn: (N, 4) boxes of the blobs' refined outlines.
     """
 
     candidates: Candidates
     tracklets: Tracklets
     drawn: list[np.ndarray]
-    small: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     described: dict[str, np.ndarray] = field(default_factory=dict)
 
 
@@ -107,12 +106,6 @@ class _Recorder(MotionDetector):
         boxes = [_boxes([target.box for target in parts]) for parts in drawn]
         self.looks[slot.frame.number - 1] = Look(candidates, tracklets, boxes)
         return [target for parts in drawn for target in parts]
-
-    def _small_targets(self, index: int, targets: list[Target]) -> list[Target]:
-        small = super()._small_targets(index, targets)
-        if (look := self.looks.get(self._buffer[index].frame.number - 1)) is not None:
-            look.small = np.array([target.box for target in small], float).reshape(-1, 4)
-        return small
 
 
 def record(case: tuple[Path, int]) -> Film:
@@ -273,10 +266,7 @@ def detect(film: Film, weights: Weights | None, accept: float = 0.0, worth: Wort
             scores = score_tracklets(candidates, look.tracklets, seen, weights[1])
             chosen = choose(candidates, scores, accept, SETTINGS.morphology.close_px, worth)
         boxes = [look.drawn[i] if i < len(look.drawn) else _widened(look.candidates, i) for i in chosen]
-        small = look.small
-        if len(small) and boxes:
-            small = small[~_holds(np.concatenate(boxes), small[:, :2] + small[:, 2:] / 2).any(axis=0)]
-        found.append(np.concatenate([*boxes, small]))
+        found.append(np.concatenate([np.zeros((0, 4)), *boxes]))
     return found
 
 
