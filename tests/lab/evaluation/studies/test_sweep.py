@@ -140,6 +140,9 @@ def test_parameters_that_mean_something_else_or_have_no_effect_are_named() -> No
     assert "difference.threshold is in grey levels with difference.kind = to_reference" in units
     assert effect == "refine.share has no effect: refine.on is false"
     assert sweep.parameter_notes(axes, NOW) == []
+    (beside,) = sweep.parameter_notes(parse_grid(["history.duration_frames=4,6"], NOW), NOW)
+    assert beside.startswith("history.duration_frames has no effect: tracklets replace the motion history")
+    assert sweep.parameter_notes(parse_grid(["history.on=true,false", "tracklets.on=true,false"], NOW), NOW) == []
     mixed = parse_grid(["difference.peak=1", "difference.kind=normalized,to_next", "refine.on=true"], NOW)
     (units,) = sweep.parameter_notes(mixed, NOW)
     assert "with difference.kind = to_next, and" in units

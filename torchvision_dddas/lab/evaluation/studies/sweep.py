@@ -17,7 +17,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, is_set, nearest, with_parameters
+from torchvision_dddas.config import (
+    Settings,
+    all_parameters,
+    changes,
+    format_toml,
+    is_set,
+    nearest,
+    uses_tracklets,
+    with_parameters,
+)
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.lab.evaluation.report.sweep import save_sweep
@@ -96,6 +105,8 @@ def parameter_notes(axes: Sequence[ParameterAxis], settings: Settings) -> list[s
         group = parameter.split(".")[0]
         if getattr(getattr(settings, group), "on", True) is False and f"{group}.on" not in tried:
             notes.append(f"{parameter} has no effect: {group}.on is false")
+        elif group == "history" and uses_tracklets(settings) and not {"tracklets.on", "difference.kind"} & set(tried):
+            notes.append(f"{parameter} has no effect: tracklets replace the motion history; set tracklets.on=false")
     return notes
 
 
