@@ -127,7 +127,7 @@ def draw_chosen(
     """Return the targets of chosen candidates. velocity_px, scores: (N, 2) and (N,) of all candidates' tracklets."""
     count = len(here.blobs)
     blobs = [i for i in chosen if i < count]
-    targets = draw_blobs(here, [here.blobs[i] for i in blobs], velocity_px[blobs], settings)
+    targets = draw_blobs(here, [here.blobs[i] for i in blobs], list(velocity_px[blobs]), settings)
     for i in chosen:
         if i >= count:
             confidence = float(1 / (1 + np.exp(-scores[i])))
