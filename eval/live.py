@@ -1,6 +1,6 @@
 """Measure the latency of live runs, and test whether memory stays constant over a long run.
 
-python eval/live.py latency [--rates 10 25 30] [--cores 1 2] [--seconds 30] [--rounds 3]
+python eval/live.py latency [--sizes 640x480 1280x720] [--rates 25] [--cores 1 2] [--seconds 20] [--rounds 3] [--now]
 python eval/live.py soak [--minutes 30] [--pace 20]
 
 The video is the tests' synthetic scene, played forwards and backwards. Measure latency on a quiet machine. The text
@@ -28,8 +28,9 @@ PERCENTILES = ("p50", "p95", "p99")
 SETTLED_S, PATIENCE_S = 1.0, 120.0
 STEP_MB, STEP_SAMPLES, MOST_STEPS = 5.0, 3, 3
 FIGURES = (
-    *(f"{name}_{p}_ms" for name in ("latency", "age") for p in PERCENTILES),
-    "growth_ms_a_minute", "processor_ms", "first_result_s", "peak_mb", "dropped", "late", "captured", "results",
+    *(f"{name}_{p}_ms" for name in ("latency", "age", "provisional") for p in PERCENTILES),
+    "growth_ms_a_minute", "processor_ms", "first_result_s", "peak_mb",
+    "dropped", "late", "captured", "looked_at", "results",
 )  # fmt: skip
 
 
@@ -37,44 +38,64 @@ def measure_latency(options: bench.Options) -> tuple[str, Any]:
     """Measure latency, age, drops and cost of `dddas run --live`. Each run is a process with a number of cores.
 
     latency: time from the capture of the newest picture to the results that it completes. age: time from the capture of
-    a picture to its own results. growth: growth of the age in a minute, by a line through the ages. Settings take turns
-    over the rounds. Figures are medians over the rounds (99 %: lowest to highest).
+    a picture to its own results. growth: growth of the age in a minute, by a line through the ages. processed: the
+    share of pictures that were processed; a run under load processes one of several. processor: for each of these.
+    --now: with `--latency now`; `provisional` is the time from the capture of a picture to its provisional tracks.
+    Settings take turns over the rounds. Figures are medians over the rounds (99 %: lowest to highest).
     """
     load, cores = bench.OtherLoad(), [n for n in options.cores if n <= len(os.sched_getaffinity(0))]
-    size = bench.parse_size(options.size)
-    cases = [(config, rate, count) for config in options.configs for rate in options.rates for count in cores]
+    cases = [
+        (config, size, rate, count)
+        for config in options.configs
+        for size in options.sizes
+        for rate in options.rates
+        for count in cores
+    ]
     runs: dict[Any, list[dict[str, float]]] = {case: [] for case in cases}
     with tempfile.TemporaryDirectory() as folder:
-        for rate in options.rates:
-            write_video(Path(folder) / f"{rate:g}.mp4", scene(size, 24), round(options.seconds * rate), rate)
+        for size, rate in {(size, rate) for _, size, rate, _ in cases}:
+            pictures = scene(bench.parse_size(size), 24)
+            write_video(Path(folder) / f"{size}-{rate:g}.mp4", pictures, round(options.seconds * rate), rate)
         for _ in range(options.rounds):
-            for config, rate, count in cases:
-                video = Path(folder) / f"{rate:g}.mp4"
-                runs[config, rate, count].append(run_live(video, config, count, options.seconds, options.people))
-                bench.log(config, rate, count, runs[config, rate, count][-1])
-    head = ["configuration", "frames/s", "cores", "latency 50 / 95 / 99 %, ms", "age 50 / 99 %, ms"]
-    head += ["growth, ms a minute", "dropped", "processor ms", "first result, s", "MB"]
+            for case in cases:
+                config, size, rate, count = case
+                video = Path(folder) / f"{size}-{rate:g}.mp4"
+                runs[case].append(run_live(video, config, count, options.seconds, options.people, options.now))
+                bench.log(*case, runs[case][-1])
+    head = ["configuration", "size", "frames/s", "cores", "latency 50 / 95 / 99 %, ms", "age 50 / 99 %, ms"]
+    head += ["provisional 50 / 99 %, ms"] * options.now
+    head += ["growth, ms a minute", "processed, %", "dropped", "processor ms", "first result, s", "MB"]
     rows, found = [], []
-    for (config, rate, count), done in runs.items():
+    for (config, size, rate, count), done in runs.items():
         values = {name: np.array([run[name] for run in done]) for name in FIGURES}
-        f = {name: float(np.nanmedian(value)) for name, value in values.items()}
+        known = {name: value for name, value in values.items() if np.isfinite(value).any()}
+        f = dict.fromkeys(FIGURES, math.nan) | {name: float(np.nanmedian(value)) for name, value in known.items()}
         worst = values["latency_p99_ms"]
         latency = " / ".join(f"{f[f'latency_{p}_ms']:.0f}" for p in PERCENTILES)
         latency += f" ({np.nanmin(worst):.0f}–{np.nanmax(worst):.0f})"
         age = f"{f['age_p50_ms']:.0f} / {f['age_p99_ms']:.0f}"
-        cells = [latency, age, f"{f['growth_ms_a_minute']:+.0f}", f"{f['dropped']:.0f} of {f['captured']:.0f}"]
-        cells += [f"{f['processor_ms']:.1f}", f"{f['first_result_s']:.2f}", f"{f['peak_mb']:.0f}"]
-        rows.append([config, f"{rate:g}", count, *cells])
-        found.append({"config": config, "rate_hz": rate, "cores": count, "runs": done})
-    about = f"`dddas run --live`, {options.size}, {bench.machine_words()}; {load.words()}; {options.seconds:g} s each, "
+        cells = [latency, age]
+        cells += [f"{f['provisional_p50_ms']:.0f} / {f['provisional_p99_ms']:.0f}"] * options.now
+        cells += [f"{f['growth_ms_a_minute']:+.0f}", f"{100 * f['looked_at'] / f['captured']:.0f}"]
+        cells += [
+            f"{f['dropped']:.0f} of {f['captured']:.0f}",
+            f"{f['processor_ms']:.1f}",
+            f"{f['first_result_s']:.2f}",
+            f"{f['peak_mb']:.0f}",
+        ]
+        rows.append([config, size, f"{rate:g}", count, *cells])
+        found.append({"config": config, "size": size, "rate_hz": rate, "cores": count, "runs": done})
+    command = f"`dddas run --live{' --latency now' * options.now}`"
+    about = f"{command}, {bench.machine_words()}; {load.words()}; {options.seconds:g} s each, "
     return f"{about}medians over {options.rounds} rounds:\n\n{bench.format_table(head, rows)}", found
 
 
-def run_live(video: Path, config: str, cores: int, seconds: float, people: bool) -> dict[str, float]:
+def run_live(video: Path, config: str, cores: int, seconds: float, people: bool, now: bool) -> dict[str, float]:
     """Return the figures of a run."""
     with tempfile.TemporaryDirectory() as out, (Path(out) / "errors.txt").open("w+") as errors:
         command = [*PROGRAM, str(video), "--live", "--emit", "json:-", "--out", out, "--quiet", "--backend", "onboard"]
         command += ([] if config == "default" else ["--config", config]) + ["--people"] * people
+        command += ["--latency", "now"] * now
         began = time.time()
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=errors, text=True, preexec_fn=partial(_restrict_cores, cores)
@@ -90,21 +111,26 @@ def run_live(video: Path, config: str, cores: int, seconds: float, people: bool)
             if line.startswith("{"):
                 if not rows:
                     first_s, start_s = time.time() - began, spent_s
-                rows.append(json.loads(line))
+                if "provisional" not in (row := json.loads(line)):
+                    rows.append(row)
         code = process.wait()
         timer.cancel()
         if code or not rows:
             errors.seek(0)
             raise SystemExit(f"{' '.join(command)} ended with {code}: {errors.read().strip()[-500:]}")
         record = json.loads(next(Path(out).glob("*/run.json")).read_text(encoding="utf-8"))
-    counts, latency = record["counts"], record["seconds"].get("latency", {})
+    counts, taken = record["counts"], record["seconds"]
     return {
-        **{f"latency_{p}_ms": 1e3 * latency.get(p, math.nan) for p in PERCENTILES},
+        **{
+            f"{name}_{p}_ms": 1e3 * taken.get(name, {}).get(p, math.nan)
+            for name in ("latency", "provisional")
+            for p in PERCENTILES
+        },
         **measure_ages(rows),
-        "processor_ms": 1e3 * (spent_s - start_s) / max(counts.get("captured", 0), 1),
+        "processor_ms": 1e3 * (spent_s - start_s) / max(counts.get("looked_at", 0), 1),
         "first_result_s": first_s,
         "peak_mb": peak_mb,
-        **{name: float(counts.get(name, 0)) for name in ("captured", "dropped", "late", "results")},
+        **{name: float(counts.get(name, 0)) for name in ("captured", "looked_at", "dropped", "late", "results")},
     }
 
 
@@ -194,8 +220,8 @@ def remove_steps(held: np.ndarray) -> tuple[np.ndarray, list[float]]:
 
 
 if __name__ == "__main__":
-    latency = {"--rates": [10.0, 25.0, 30.0], "--cores": [1, 2], "--configs": ["fast"], "--size": "640x480"}
-    latency |= {"--people": False, "--seconds": 30.0, "--rounds": 3}
+    latency = {"--rates": [25.0], "--cores": [1, 2], "--configs": ["fast"], "--sizes": ["640x480", "1280x720"]}
+    latency |= {"--people": False, "--now": False, "--seconds": 20.0, "--rounds": 3}
     soak = {"--minutes": 30.0, "--pace": 20.0, "--size": "320x240", "--rate": 10.0, "--people": False}
     soak |= {"--config": "fast", "--growth-mb": 4.0}
     bench.main(__doc__, {"latency": (measure_latency, latency), "soak": (measure_soak, soak)})

@@ -72,7 +72,7 @@ def test_live_runs_that_drop_nothing_have_the_tables_of_offline_runs(
     person = People(box, np.array([0.9]), np.ones(1), np.zeros(1, bool), box)
     monkeypatch.setattr("torchvision_dddas.control.ground_team.detect_people", lambda *_: [person])
     monkeypatch.setattr("torchvision_dddas.control.ground_team.load_scorer", lambda *_: object())
-    monkeypatch.setattr("torchvision_dddas.live.session.load_engine", stub_engine()["load_engine"])
+    monkeypatch.setattr("torchvision_dddas.live.run_path.load_engine", stub_engine()["load_engine"])
     small = PLATFORM.replace("1280", "64").replace("960", "48").replace("focal_px = 1000", "focal_px = 60")
     log = file("log.csv", LOG)
     ugv = file("ugv.toml", small.replace('detections = "people.csv"', 'clip = "ugv1"\nname = "ugv1"'))

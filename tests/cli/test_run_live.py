@@ -98,11 +98,43 @@ def test_the_cost_of_a_look_is_measured_where_frames_do_not_wait_unless_it_is_se
     assert session(tmp_path)[1]["settings"]["interval"]["cost"] == cost
 
 
+def test_latency_now_tells_each_frame_at_once_and_again_when_it_is_settled(dddas, frames, tmp_path):
+    mot = tmp_path / "rows.txt"
+    words = ("run", frames, *FAST, "--quiet", "--people")
+    assert dddas(*words, "--out", tmp_path / "usual").exit_code == 0
+    done = dddas(*words, "--out", tmp_path / "now", "--latency", "now", "--emit", f"mot:{mot}")
+    assert done.exit_code == 0, done.output
+    usual, (_, record, told) = session(tmp_path / "usual")[2], session(tmp_path / "now")
+    first = [line for line in told if "provisional" in line]
+    settled = [line for line in told if "provisional" not in line]
+    assert [line["frame"] for line in first] == [line["frame"] for line in settled] == list(range(1, FRAMES + 1))
+    assert all(line["provisional"] is True and line["people"] is None and "corrects" not in line for line in first)
+    assert all(told.index(one) < told.index(other) for one, other in zip(first, settled, strict=True))
+    for line, known in zip(settled, usual, strict=True):
+        assert [target["box_px"] for target in line["targets"]] == [target["box_px"] for target in known["targets"]]
+        assert line["people"] == known["people"] and line["adjustments"] == known["adjustments"]
+    named = [[target["id"] for target in line["targets"] if target["id"]] for line in first]
+    for line, names in zip(settled, named, strict=True):
+        assert set(line.get("corrects", [])) <= set(names)
+    assert any(named)
+    assert len(mot.read_text().splitlines()) == sum(len([t for t in line["targets"] if t["id"]]) for line in settled)
+    assert record["counts"]["results"] == FRAMES and record["seconds"]["provisional"]["p50"] > 0
+
+
+def test_latency_now_is_refused_with_crowds_and_for_a_run_that_is_not_live(dddas, frames, file, tmp_path):
+    out = ("--latency", "now", "--out", tmp_path / "out")
+    assert "give --live too" in bad(dddas("run", frames, *out))
+    log = file("log.csv", "time_s,altitude_m,speed_m_s,east_m,north_m,heading_deg,pitch_deg\n0,40,0,0,0,0,90\n")
+    crowds = ("--telemetry", log, "--set", "crowds.join_m=3", "--rate", "10")
+    assert "cannot work with crowds.join_m" in bad(dddas("run", frames, *FAST, *crowds, *out))
+    assert not (tmp_path / "out").exists()
+
+
 def test_notes_on_the_files_are_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
     def noting(*given):
         return replace(assemble_files(*given), notes=["bravo has no colour"])
 
-    monkeypatch.setattr("torchvision_dddas.live.session.assemble_files", noting)
+    monkeypatch.setattr("torchvision_dddas.live.run_inputs.assemble_files", noting)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert "dddas: note: bravo has no colour\n" in done.stderr

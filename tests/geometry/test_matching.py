@@ -1,8 +1,9 @@
-"""One-to-one assignment: pairs of the largest sum of scores or the least cost, with SciPy only where it is needed."""
+"""One-to-one assignment: pairs of the largest sum of scores or the least cost."""
 
 import itertools
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import best_pairs, cheapest
+from torchvision_dddas.geometry import best_pairs, cheapest, matching
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (1, 1), (2, 7), (7, 2), (12, 12), (12, 40), (40, 12)])
@@ -35,13 +36,24 @@ def printed(script: str) -> str:
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_scipy_is_loaded_only_where_two_want_the_same() -> None:
+def test_an_assignment_loads_scipys_solver_without_the_rest_of_scipy_optimize() -> None:
     script = (
         "import sys, numpy as np; from torchvision_dddas.geometry import cheapest\n"
         "for cost in ([[0., 1, 9], [1, 0, 9]], [[0., 1], [1, 0], [9, 9]], [[0., 1], [0, 2]]):\n"
-        "    cheapest(np.array(cost)); print('scipy.optimize' in sys.modules)"
+        "    cheapest(np.array(cost))\n"
+        "print('scipy.optimize' in sys.modules)\n"
+        "from scipy.optimize import linear_sum_assignment  # still works beside the loaded solver\n"
+        "print(linear_sum_assignment(np.eye(2))[1].tolist())"
     )
-    assert printed(script).split() == ["False", "False", "True"]
+    assert printed(script).splitlines() == ["False", "[1, 0]"]
+
+
+def test_an_assignment_loads_scipy_optimize_if_it_has_no_module_for_the_solver(monkeypatch) -> None:
+    finder = SimpleNamespace(find_spec=lambda *_: None)
+    monkeypatch.setattr("torchvision_dddas.geometry.matching.PathFinder", finder)
+    matching.load_assignment_solver.cache_clear()
+    assert matching.load_assignment_solver() is linear_sum_assignment
+    matching.load_assignment_solver.cache_clear()
 
 
 def test_what_a_run_onboard_loads_leaves_the_slow_libraries_out() -> None:

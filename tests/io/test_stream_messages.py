@@ -70,6 +70,8 @@ def test_the_page_names_every_field_and_no_other():
     tracks = replace(frame.tracked.tracks, label=np.array(["car"] * len(frame.tracked.tracks), object))
     named_frame = replace(frame, tracked=replace(frame.tracked, tracks=tracks))
     lines = [*json_lines(ABOUT, frame, tracked(), most_bytes=512), *json_lines(ABOUT, named_frame, None), example()]
+    for mark in ({"provisional": True}, {"corrects": (1,)}):
+        lines += json_lines(ABOUT, replace(frame, tracked=replace(frame.tracked, tracks=replace(tracks, **mark))), None)
     for fields in map(strict, lines):
         sent |= set(fields) | {f"targets[].{name}" for row in fields["targets"] for name in row}
         sent |= {f"{part}.{name}" for part in ("ground", "appearance") for name in fields.get(part) or {}}
@@ -92,6 +94,22 @@ def test_a_target_has_its_identity_its_box_and_its_place():
     assert (loose["id"], loose["link"], loose["heading_deg"], loose["seen"]) == (None, None, None, True)
     assert [mark["name"] for mark in fields["ground"]["landmarks"]] == list(NAMES)
     assert "lonlat_deg" not in one(located(1, origin=None), None)["targets"][0]
+
+
+def test_provisional_tracks_are_marked_and_settled_tracks_name_what_they_correct():
+    frame = located()
+    frames = [
+        replace(frame, tracked=replace(frame.tracked, tracks=replace(frame.tracks, **mark)))
+        for mark in ({}, {"provisional": True}, {"corrects": (2, 5)})
+    ]
+    marks = [
+        {name: line[name] for name in ("provisional", "corrects") if name in line}
+        for line in (one(frame, None) for frame in frames)
+    ]
+    assert marks == [{}, {"provisional": True}, {"corrects": [2, 5]}]
+    parts = [strict(line) for line in json_lines(ABOUT, frames[1], None, most_bytes=512)]
+    assert len(parts) > 1 and all(part["provisional"] for part in parts)
+    assert mot_lines(frames[0], None) and not mot_lines(frames[1], None)
 
 
 def test_what_was_not_searched_is_null_and_what_was_not_found_is_empty():

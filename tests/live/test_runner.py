@@ -1,7 +1,5 @@
 """The loop of a live run goes on after errors, and sheds load."""
 
-import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.receiver import DeadCamera
-from torchvision_dddas.live.runner import Feed, LoadShedding, RepeatedFailure, record_result, results, send_result
+from torchvision_dddas.live.runner import Feed, LoadShedding, RepeatedFailure, results
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Adjustment, Detections, Frame, FrameResult, Telemetry, TrackedFrame, Tracks
 
@@ -161,45 +159,6 @@ def test_telemetry_without_heights_above_ground_is_not_called_silent_while_it_sp
     assert health.snapshot().events == () and health.snapshot().troubles == ()
 
 
-def test_latency_is_of_the_newest_picture_and_late_results_are_counted():
-    health, feed = Health(), feed_of(1, taken_s=time.monotonic() - 1.0)
-    (frame,) = feed
-    record_result(result_of(frame, person=1), feed, health, 80.0)
-    now = health.snapshot()
-    assert now.counts["late"] == now.counts["results"] == 1
-    assert now.seconds["latency"][0] >= 1.0
-    assert now.gauges["targets"] == now.gauges["people"] == 1
-    record_result(result_of(frame), feed, health, 1e9)
-    assert health.snapshot().counts["late"] == 1
-
-
-def test_the_row_of_a_picture_that_never_came_is_not_late():
-    health, feed = Health(), feed_of(1, taken_s=time.monotonic() - 5.0)
-    (frame,) = feed
-    record_result(result_of(replace(frame, taken_s=float("nan"))), feed, health, 80.0)
-    assert "late" not in health.snapshot().counts or health.snapshot().counts["late"] == 0
-
-
-class Sink:
-    def __init__(self, name, error=None):
-        self.name, self.error, self.got = name, error, 0
-
-    def write(self, surveyed, people=None):
-        self.got += 1
-        if self.error is not None:
-            raise self.error
-
-
-def test_a_stream_that_cannot_write_a_frame_does_not_stop_the_others():
-    health = Health()
-    sinks: list[Any] = [Sink("bad", ValueError("no such digit")), Sink("good")]
-    send_result(result_of(Frame(3, 0.0, PICTURE)), sinks, health)
-    assert sinks[1].got == 1
-    (event,) = health.snapshot().events
-    assert (event.kind, event.frame) == ("sink", 3)
-    assert "bad: left out, ValueError: no such digit" in event.text
-
-
 # -- load --------------------------------------------------------------------------------------------------------------
 
 BASE = with_parameters(
@@ -254,6 +213,13 @@ def test_neither_one_long_step_nor_those_before_a_change_count_and_a_burst_passe
     assert source.every == 4
     source.feed(*[0.01] * 800)
     assert source.state == (1, 400)
+
+
+def test_a_burst_of_slow_pictures_neither_sheds_load_nor_halves_the_rate_for_good():
+    assert Loaded().feed(*[0.028] * 40, *[0.045] * 5, *[0.028] * 40) == []
+    source = Loaded()
+    source.feed(*[0.1] * 10, *[0.030] * 800)
+    assert source.every == 1
 
 
 @pytest.mark.parametrize("keypoints", [60, 150])

@@ -2,6 +2,7 @@
 
 import os
 import re
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,9 +44,17 @@ if TYPE_CHECKING:
     from torchvision_dddas.geo import Zones
     from torchvision_dddas.io.output import RunRecord
 
+
 SIMULATED = "sim:"
 PASSWORD = "DDDAS_PASSWORD"  # in the environment
 _LOGIN = re.compile(r"([a-z][a-z0-9+.-]*://[^/?#@:]+)@(.*)", re.I | re.S)
+
+
+class Latency(StrEnum):
+    """When a live run gives identities: at once and provisionally, or when they are settled."""
+
+    settled = "settled"
+    now = "now"
 
 
 @report_errors
@@ -151,6 +160,12 @@ def run(
     wait: Annotated[
         bool, typer.Option("--wait", help="With --live: wait for a camera or stream that is not there yet.")
     ] = False,
+    latency: Annotated[
+        Latency | None,
+        typer.Option(
+            help="With --live: now gives provisional identities at once. [default: settled]", show_default=False
+        ),
+    ] = None,
     command: Annotated[
         str | None,
         typer.Option(
@@ -204,7 +219,7 @@ def run(
             refuse_options({"--serve-token": serve_token}, "is for --serve PORT; give it too")
     else:
         others = {"--emit": emit, "--serve": serve, "--serve-token": serve_token, "--command": command}
-        others |= {"--people": people or None, "--wait": wait or None}
+        others |= {"--people": people or None, "--wait": wait or None, "--latency": latency}
         refuse_options({**others, **limits}, "is for a run that keeps up with a camera; give --live too")
         for file in (file for file in (*logs, landmarks) if file is not None and not file.exists()):
             from torchvision_dddas.live import is_live_input
@@ -243,30 +258,32 @@ def run(
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_settings(config, set_, ignore, quiet, geoid)
     if live:
-        from torchvision_dddas.live import CommandOptions, run_live
+        from torchvision_dddas.live import CommandOptions, LiveOptions, run_live
 
-        code = run_live(
-            out,
-            clip,
-            given,
-            telemetry,
-            interval,
-            settings,
-            backend.value,
-            emit or (),
-            serve,
-            people,
-            rate,
-            quiet,
-            wait,
-            placed,
-            ground or (),
-            aerial or (),
-            network,
-            movers,
-            None if command is None else CommandOptions(command, allow_commands, geofence, altitude_band),
-            serve_token,
+        options = LiveOptions(
+            out=out,
+            clip=clip,
+            settings=settings,
+            given=given,
+            telemetry=telemetry,
+            interval=interval,
+            backend=backend.value,
+            emit=emit or (),
+            serve=serve,
+            people=people,
+            rate_hz=rate,
+            quiet=quiet,
+            wait=wait,
+            zones=placed,
+            ground=ground or (),
+            aerial=aerial or (),
+            detector=network,
+            movers=movers,
+            commanding=None if command is None else CommandOptions(command, allow_commands, geofence, altitude_band),
+            serve_token=serve_token,
+            lag=0 if latency is Latency.now else None,
         )
+        code = run_live(options)
         raise typer.Exit(Ended(code))  # the last line on the screen says where the results are
     from torchvision_dddas import open_video
     from torchvision_dddas.io.atomic_files import refuse_own_input

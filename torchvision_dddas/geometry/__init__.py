@@ -13,7 +13,7 @@ from torchvision_dddas.geometry.geodesy import (
 )
 from torchvision_dddas.geometry.geoid import GEOID_SIGMA_M, geoid_height
 from torchvision_dddas.geometry.jitter import Jitter
-from torchvision_dddas.geometry.matching import best_pairs, cheapest
+from torchvision_dddas.geometry.matching import best_pairs, cheapest, load_assignment_solver
 from torchvision_dddas.geometry.namespace import namespace
 from torchvision_dddas.geometry.plane_maps import background_flow, chain, corner_error, transfer
 from torchvision_dddas.geometry.polygons import (
@@ -75,6 +75,7 @@ __all__ = [
     "inside",
     "inverse_2x2",
     "is_inside",
+    "load_assignment_solver",
     "lonlat",
     "middles_of",
     "namespace",

@@ -1,4 +1,10 @@
-"""Optimal one-to-one assignment of rows to columns. SciPy is loaded only if needed."""
+"""Optimal one-to-one assignment of rows to columns. SciPy's solver is loaded alone, and only if needed."""
+
+from collections.abc import Callable
+from functools import cache
+from importlib.machinery import PathFinder
+from importlib.util import find_spec, module_from_spec
+from pathlib import Path
 
 import numpy as np
 
@@ -9,8 +15,7 @@ from torchvision_dddas.types import Float, Int
 def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """Return the rows, ascending, and the columns of the min(N, M) pairs with the smallest sum of finite costs."""
     cost = np.asarray(cost, float)
-    # If the best columns of all rows differ, they are the optimal pairs. Otherwise SciPy is loaded: `scipy.optimize`
-    # takes 0.5 s and 45 MB to load, as much as the rest of an onboard run.
+    # If the best columns of all rows differ, they are the optimal pairs. Otherwise SciPy's solver is needed.
     tall = cost.shape[0] > cost.shape[1]
     best = (cost.T if tall else cost).argmin(axis=1) if cost.size else np.zeros(0, np.int64)
     if len(set(best.tolist())) == len(best):
@@ -18,9 +23,27 @@ def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[
             return np.arange(len(best)), best
         order = np.argsort(best)
         return best[order], order
+    return load_assignment_solver()(cost)
+
+
+@cache
+def load_assignment_solver() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """Return `scipy.optimize.linear_sum_assignment`.
+
+    Load its extension module alone. `scipy.optimize` takes 0.5 s and 45 MB to load, as much as the rest of an onboard
+    run, and a live run would lose the pictures of that time. Load the package if there is no such module.
+    """
+    scipy = find_spec("scipy")
+    folders = [str(Path(place) / "optimize") for place in (scipy.submodule_search_locations or ())] if scipy else []
+    spec = PathFinder.find_spec("scipy.optimize._lsap", folders)
+    if spec is not None and spec.loader is not None:
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        if solver := getattr(module, "linear_sum_assignment", None):
+            return solver
     from scipy.optimize import linear_sum_assignment
 
-    return linear_sum_assignment(cost)
+    return linear_sum_assignment
 
 
 def best_pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.ndarray, "K 2"]:

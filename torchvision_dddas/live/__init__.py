@@ -5,11 +5,12 @@ from torchvision_dddas.live.commanding import CommandOptions
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.report_inputs import is_live_input
 from torchvision_dddas.live.runner import LoadShedding
-from torchvision_dddas.live.session import run_live
+from torchvision_dddas.live.session import LiveOptions, run_live
 
 __all__ = [
     "CommandOptions",
     "Health",
+    "LiveOptions",
     "LiveSource",
     "LoadShedding",
     "is_live_input",

@@ -1,6 +1,5 @@
 """The loop of a live run: take frames, send results, use cheaper settings under load, and restart after an error."""
 
-import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +12,6 @@ from torchvision_dddas import control
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator
-from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
@@ -162,7 +160,10 @@ class _Renumbering:
     def _shift(self, kind: int, tracked: TrackedFrame) -> TrackedFrame:
         before, tracks = self._before[kind], tracked.tracks
         self._highest[kind] = max(self._highest[kind], before + int(tracks.identity.max(initial=0)))
-        return replace(tracked, tracks=replace(tracks, identity=tracks.identity + before)) if before else tracked
+        if not before:
+            return tracked
+        corrects = tuple(identity + before for identity in tracks.corrects)
+        return replace(tracked, tracks=replace(tracks, identity=tracks.identity + before, corrects=corrects))
 
 
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
@@ -185,7 +186,7 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
                 return
             failures += 1
             number = feed.newest.number if feed.newest is not None else 0
-            words = f"{type(error).__name__}: {error} ({_where(error)})"
+            words = f"{type(error).__name__}: {error} ({where_raised(error)})"
             if failures >= _MOST_FAILURES:
                 raise RepeatedFailure(
                     f"{failures} times in a row the work on a frame failed, at last: {words}"
@@ -198,38 +199,7 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
         renumbered.restart()
 
 
-def send_result(result: Result, streams: Iterable[Stream], health: Health) -> None:
-    """Write a result to all streams. If a stream raises, that stream omits the result, and an event records it."""
-    for stream in streams:
-        try:
-            stream.write(*result)
-        except Exception as error:
-            number = result[0].tracked.number
-            health.event("sink", f"{stream.name}: left out, {type(error).__name__}: {error} ({_where(error)})", number)
-
-
-def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:
-    """Record the latency of a result that was sent, and what it holds, in the health."""
-    located, people = result
-    now_s, frame = time.monotonic(), located.tracked.frame
-    if frame is not None and isfinite(frame.taken_s):  # results for missing pictures are not late
-        health.took("age", now_s - frame.taken_s)
-        if feed.newest is not None and isfinite(feed.newest.taken_s):
-            latency_s = now_s - feed.newest.taken_s
-            health.took("latency", latency_s)
-            health.timed(1000 * latency_s > deadline_ms)
-    health.gauge("targets", len(located.tracked.tracks))
-    if people is not None:
-        health.gauge("people", len(people.tracks))
-    health.count("unreliable", int(bool(located.tracked.cause)))
-    health.adjusted(located.adjustments, control.SHED)
-    if (use := located.tracks.appearance) is not None:
-        health.count("appearance_decisions")
-        health.count("appearance_looked_at", int(use.looked))
-    health.result()
-
-
-def _where(error: BaseException) -> str:
+def where_raised(error: BaseException) -> str:
     """Return the innermost line of this package in the traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if "torchvision_dddas" in f.filename] or frames
@@ -237,7 +207,7 @@ def _where(error: BaseException) -> str:
 
 
 # The cost of a frame is the mean of recent costs without the largest one, which may include waiting for something else.
-_MOST_FRAMES = 10
+_MOST_FRAMES = 20
 _FEWEST_FRAMES = 5
 
 

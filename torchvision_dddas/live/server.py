@@ -284,6 +284,7 @@ _SECONDS = {
     "latency": ("latency", "From the capture of the newest picture to the results that it settles."),
     "age": ("age of a result", "From the capture of a picture to its own results."),
     "step": ("work on a picture", "Work on a picture."),
+    "provisional": ("age of provisional tracks", "From the capture of a picture to its provisional tracks."),
 }
 _HELP = {name: words for table in (_COUNTS, _GAUGES, _SECONDS) for name, (_, words) in table.items()}
 

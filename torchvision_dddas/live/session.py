@@ -1,21 +1,20 @@
 """One session of `dddas run --live`: process live pictures for as long as they come."""
 
 import signal
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import inf, isnan, nan
 from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, is_set, with_parameters
-from torchvision_dddas.detection import OnnxDetector, check_length, load_engine
-from torchvision_dddas.errors import InputError, printable, without_secrets
+from torchvision_dddas.detection import OnnxDetector, check_length
+from torchvision_dddas.errors import InputError, without_secrets
 from torchvision_dddas.geo import Zones
 from torchvision_dddas.io.interrupts import Stopped, StopSignals
 from torchvision_dddas.io.output import (
@@ -31,302 +30,333 @@ from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.access import choose_access
 from torchvision_dddas.live.capture import LiveSource
-from torchvision_dddas.live.commanding import CommandOptions, open_commands
-from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
-from torchvision_dddas.live.live_landmarks import open_landmarks
-from torchvision_dddas.live.live_telemetry import LiveTelemetry, open_telemetry
-from torchvision_dddas.live.log_alignment import describe_landmarks, describe_log
+from torchvision_dddas.live.commanding import CommandOptions, LiveCommands, open_commands
+from torchvision_dddas.live.health import Health, StatusWriter
 from torchvision_dddas.live.operator_view import OperatorView
 from torchvision_dddas.live.receiver import DeadCamera
-from torchvision_dddas.live.report_inputs import KLV
-from torchvision_dddas.live.runner import (
-    Feed,
-    LoadShedding,
-    RepeatedFailure,
-    Result,
-    record_result,
-    results,
-    send_result,
-)
+from torchvision_dddas.live.result_writer import ResultWriter
+from torchvision_dddas.live.run_inputs import RunInputs
+from torchvision_dddas.live.run_path import build_path
+from torchvision_dddas.live.runner import Feed, RepeatedFailure, results
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
 from torchvision_dddas.live.team import LiveTeam
+from torchvision_dddas.live.terminal import print_event, print_line, print_page, print_snapshot, summarize
 from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
-from torchvision_dddas.people import PersonTracker, load_scorer
-from torchvision_dddas.pipeline import (
-    AerialInput,
-    Assembly,
-    Pipeline,
-    assemble_files,
-    completion,
-    locator_facts,
-    map_site,
-    note_unused,
-)
+from torchvision_dddas.pipeline import AerialInput, locator_facts, map_site, note_unused
 from torchvision_dddas.runtime import VERSION
-from torchvision_dddas.tracking import FrameTracker
-from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry
+from torchvision_dddas.tracking import Tracker
+from torchvision_dddas.types import FrameResult
 
 _WAITING = "waiting for the camera"
 # Parameters of the motion detector that landmarks and a commanded vehicle use too.
 _SHARED = ("small.min_area_px", "gates.expected_size_m", "gates.focal_px")
-_CLEAR = "\r\x1b[K"
 _COUNTED = (
     *("captured", "dropped", "looked_at", "undecoded", "concealed", "reconnects", "clock_jumps"),
     *("results", "late", "begun_anew"),
 )
 
 
-def run_live(
-    out: Path,
-    clip: str,
-    given: AerialInput | None,
-    telemetry: Path | None,
-    interval: int,
-    settings: Settings,
-    backend: str = "auto",
-    emit: Sequence[str] = (),
-    serve: str | None = None,
-    people: bool = False,
-    rate_hz: float | None = None,
-    quiet: bool = False,
-    wait: bool = False,
-    zones: Zones | None = None,
-    ground: Sequence[Path] = (),
-    aerial: Sequence[Path] = (),
-    detector: OnnxDetector | None = None,
-    movers: bool = False,
-    commanding: CommandOptions | None = None,
-    serve_token: str | None = None,
-) -> int:
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of `run_live`. out: the folder that gets the session's folder.
+
+    telemetry: the log beside `given`. emit: streams. serve: address of the page. wait: wait for an absent camera at the
+    start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of its commands.
+    serve_token: as `choose_access` takes it. lag: as for `Tracker`; provisional results go to the streams alone.
+    """
+
+    out: Path
+    clip: str
+    settings: Settings
+    given: AerialInput | None = None
+    telemetry: Path | None = None
+    interval: int = 1
+    backend: str = "auto"
+    emit: Sequence[str] = ()
+    serve: str | None = None
+    people: bool = False
+    rate_hz: float | None = None
+    quiet: bool = False
+    wait: bool = False
+    zones: Zones | None = None
+    ground: Sequence[Path] = ()
+    aerial: Sequence[Path] = ()
+    detector: OnnxDetector | None = None
+    movers: bool = False
+    commanding: CommandOptions | None = None
+    serve_token: str | None = None
+    lag: int | None = None
+
+
+def run_live(options: LiveOptions) -> int:
     """Run until the pictures end or a signal ends the run, and return the exit code. Write a new folder under out.
 
-    SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. wait: wait for an
-    absent camera at the start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of
-    its commands. serve_token: as `choose_access` takes it. Raise InputError for any other fault at the start; a later
-    fault becomes an event.
+    SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. Raise InputError
+    for a fault at the start; a later fault becomes an event.
     """
-    address = None if serve is None else parse_address(serve)
-    access = None if address is None else choose_access(address[0], serve_token)
-    if wait and stream_target(clip) is None:
-        raise InputError(f"--wait is for a camera or a stream, but {clip} is neither; leave --wait out")
-    if backend == "auto":  # the torch engine finishes frames in batches, which would delay live results
-        backend = "onboard"
-    # Measure O of the interval rule unless it is set; without a pace frames wait, so that every run gives the same.
-    unused = note_unused(settings, _SHARED) if detector is not None and not movers and not aerial else []
-    if settings.live.pace and not is_set(settings, "interval.cost"):
-        settings = with_parameters(settings, {"interval.cost": 0.0})
-    health, supervisor, live = Health(), Supervisor(), settings.live
-    for name in _COUNTED:  # a count that exists from the start can be distinguished from a missing one
-        health.count(name, 0)
+    if options.wait and stream_target(options.clip) is None:
+        wanted = f"--wait is for a camera or a stream, but {options.clip} is neither; leave --wait out"
+        raise InputError(wanted)
     with ExitStack() as stack:
-        # Find possible faults before the session has a folder.
-        watchdog = Watchdog(health, live.watchdog_s, supervisor)
-        name, pages = without_secrets(clip), dict[str, Page]()
-        server = None if address is None else stack.enter_context(HealthServer(address, pages, access))
-        view = OperatorView(partial(health.event, "page"))
-        stack.callback(view.close)
-        health.trouble("waiting", _WAITING)
-        pages |= health_pages(health, watchdog, (), lambda: _WAITING, name, VERSION, inf, view)
-        if wait:  # the service is up, but has no camera yet
-            supervisor.say("READY=1", f"STATUS={_WAITING}")
-            if server is not None and (not quiet or server.access.is_made):
-                _print_page(server)
+        session = _Session(options, stack)
+        session.open_page()
+        if (code := session.open_camera()) is not None:
+            return code
+        session.open_inputs()
+        session.open_outputs()
+        session.begin()
+        session.process()
+        session.end()
+    return session.tell_end()
+
+
+class _Session:
+    """The state of a session. `run_live` calls its methods in order. stack: closes what they open."""
+
+    def __init__(self, options: LiveOptions, stack: ExitStack) -> None:
+        self.options, self.stack = options, stack
+        settings, is_network_alone = options.settings, options.detector is not None and not options.movers
+        # The torch engine finishes frames in batches, which would delay live results.
+        self.backend = "onboard" if options.backend == "auto" else options.backend
+        self.unused = note_unused(settings, _SHARED) if is_network_alone and not options.aerial else []
+        # Measure O of the interval rule unless it is set; without a pace frames wait, so that every run gives the same.
+        if settings.live.pace and not is_set(settings, "interval.cost"):
+            settings = with_parameters(settings, {"interval.cost": 0.0})
+        self.settings, self.live = settings, settings.live
+        self.health, self.supervisor = Health(), Supervisor()
+        for name in _COUNTED:  # a count that exists from the start can be distinguished from a missing one
+            self.health.count(name, 0)
+        self.watchdog = Watchdog(self.health, self.live.watchdog_s, self.supervisor)
+        self.name = without_secrets(options.clip)
+        self.failure, self.tally = "", _Located()
+
+    # -- the start: find possible faults before the session has a folder ----------------------------------------------
+
+    def open_page(self) -> None:
+        """Serve a page that says that the run waits for its camera."""
+        options, address = self.options, None if self.options.serve is None else parse_address(self.options.serve)
+        access = None if address is None else choose_access(address[0], options.serve_token)
+        self.pages = dict[str, Page]()
+        self.server: HealthServer | None = None
+        if address is not None:
+            self.server = self.stack.enter_context(HealthServer(address, self.pages, access))
+        self.view = OperatorView(partial(self.health.event, "page"))
+        self.stack.callback(self.view.close)
+        self.health.trouble("waiting", _WAITING)
+        self.pages |= health_pages(self.health, self.watchdog, (), lambda: _WAITING, self.name, VERSION, inf, self.view)
+        if options.wait:  # the service is up, but has no camera yet
+            self.supervisor.say("READY=1", f"STATUS={_WAITING}")
+            self._print_page()
+
+    def open_camera(self) -> int | None:
+        """Open the source. Return an exit code if the run ends while it waits for the camera, else None."""
         told: list[Event] = []
 
         def waiting() -> None:
             """Notify the supervisor, and report once why there is no camera yet."""
-            watchdog.check()
-            if not told and (events := health.snapshot().events):
+            self.watchdog.check()
+            if not told and (events := self.health.snapshot().events):
                 told.append(events[0])
-                _print_event(events[0])
+                print_event(events[0])
 
+        self.waiting: Callable[[], object] | None = waiting if self.options.wait else None
+        scale, rate_hz = self.settings.levels.given, self.options.rate_hz
         try:
-            scale, told_by = settings.levels.given, waiting if wait else None
-            source = LiveSource(clip, live, health, rate_hz=rate_hz, full_scale=scale, waiting=told_by)
+            self.source = LiveSource(
+                self.options.clip, self.live, self.health, rate_hz=rate_hz, full_scale=scale, waiting=self.waiting
+            )
         except DeadCamera as error:
-            _print(str(error))
+            print_line(str(error))
             return HUNG
         except Stopped as stopped:
             if stopped.number == signal.SIGTERM:  # a supervisor ends a run that has no camera yet
                 return 0
             raise
-        stack.callback(source.close)
-        health.trouble("waiting")
-        health.begin()
-        if source.recorded is not None:
-            check_length(source.recorded)
-        reports = open_telemetry(telemetry, source, settings.aerial, health)
-        is_awaited = reports is not None and reports.is_awaited
-        if reports is not None:
-            stack.callback(reports.close)
-            if is_awaited:
-                reports.wait(waiting if wait else None)
-                given = replace(given or AerialInput(), telemetry=Path(reports.name))
+        self.stack.callback(self.source.close)
+        self.health.trouble("waiting")
+        self.health.begin()
+        if self.source.recorded is not None:
+            check_length(self.source.recorded)
+        return None
 
-        marks = open_landmarks(None if given is None else given.landmarks, source, health)
-        if marks is not None:
-            stack.callback(marks.close)
-            marks.wait(waiting if wait else None)
-
-        def prepare() -> Assembly:
-            """Assemble the run with its files, or with the newest reports."""
-            newest, log = given, telemetry if reports is None or reports.raw is None else reports.record()
-            if newest is not None and isinstance(log, Telemetry):
-                newest = replace(newest, telemetry=log)
-            if newest is not None and marks is not None:
-                start_utc_s = time.time() if isnan(source.start_utc_s) else source.start_utc_s
-                newest = replace(newest, landmarks=marks.record(start_utc_s, source.rate_hz))
-            return assemble_files(newest, log, settings, source, backend, clip)
-
-        ready = prepare()
+    def open_inputs(self) -> None:
+        """Open all other inputs and the command link, and build the path from frames to results."""
+        options, health, source, stack = self.options, self.health, self.source, self.stack
+        self.inputs = inputs = RunInputs(
+            *(source, options.clip, options.given, options.telemetry, self.settings, self.backend, health),
+            *(self.waiting, stack),
+        )
+        self.ready = ready = inputs.assemble()
         ready.notes.extend([str(source.levels)] if source.levels else [])
-        ready.notes.extend([*detector.notes, *unused] if detector is not None else ())
-        flight, is_recording, offset_s = ready.telemetry, stream_target(clip) is None, settings.aerial.clock_offset_s
-        site = None if ready.watch is None else ready.watch.locator.site
-        if zones is not None:
-            zones.check(site is not None, None if site is None else site.origin_deg)
-        if reports is not None and is_awaited:
-            ready.notes.append(f"the telemetry comes live from {reports.name}, and is aligned by the clock")
-        elif flight is not None:
-            ready.notes.append(describe_log(flight, is_recording, time.time(), offset_s))
-        if site is not None and not is_recording and marks is None:
-            ready.notes.extend(describe_landmarks(site.landmarks))
-        team = LiveTeam((ground, aerial), settings, backend, ready.watch, source, health) if ground or aerial else None
-        commands = None
-        if commanding is not None:
-            if commanding.allow and is_recording:
-                raise InputError(f"--allow-commands is for a camera or a stream, but {name} shows another time")
-            locator = None if ready.watch is None else ready.watch.locator
+        ready.notes.extend([*options.detector.notes, *self.unused] if options.detector is not None else ())
+        locator = None if ready.watch is None else ready.watch.locator
+        if options.zones is not None:
+            options.zones.check(locator is not None, None if locator is None else locator.site.origin_deg)
+        ready.notes.extend(inputs.describe(ready))
+        Tracker(ready.settings, backend=ready.engine.name, lag=options.lag)  # refuses what cannot work
+        if options.lag is not None and ready.settings.crowds.join_m and locator is not None:
+            raise InputError(
+                "--latency now cannot work with crowds.join_m, which gives crowds their identities later; leave one out"
+            )
+        platforms, self.team = (options.ground, options.aerial), None
+        if any(platforms):
+            self.team = LiveTeam(platforms, self.settings, self.backend, ready.watch, source, health)
+        self.commands: LiveCommands | None = None
+        if (commanding := options.commanding) is not None:
+            if commanding.allow and inputs.is_recording:
+                shown = f"--allow-commands is for a camera or a stream, but {self.name} shows another time"
+                raise InputError(shown)
             opening = open_commands(commanding, ready.settings, source.size, source.rate_hz, locator, health)
-            commands = stack.enter_context(opening)
-        # For a recording, times of day come from its own log, if the log has a clock.
-        recorded_utc_s = flight.start_utc_s if is_recording and flight is not None else nan
-        begin = build_path(ready, source, people, interval, backend, health, prepare, detector, movers)
+            self.commands = stack.enter_context(opening)
+        self.path = build_path(
+            *(ready, source, options.people, options.interval, self.backend, health, inputs.assemble),
+            *(options.detector, options.movers, options.lag),
+        )
+
+    def open_outputs(self) -> None:
+        """Open the streams and the session's folder with its record."""
+        options, health, ready = self.options, self.health, self.ready
         # Data that streams need; the time follows the source's clock.
-        about = About(time.time())
-        if site is not None and ready.watch is not None:
-            height_m, locator = site.plane_above_sea_m + site.geoid_m, ready.watch.locator
-            about = About(time.time(), site.origin_deg is not None, site.landmarks.names, locator.camera, height_m)
-        opened = stack.enter_context(ExitStack())
-        streams = _open(opened, emit, about, health, live, "--emit")
-        folder = make_session_folder(out)
-        streams = _open(opened, [f"json:{folder / RESULTS}"], about, health, live, "--out") + streams
+        self.about = About(time.time())
+        if ready.watch is not None:
+            site, camera = ready.watch.locator.site, ready.watch.locator.camera
+            height_m = site.plane_above_sea_m + site.geoid_m
+            self.about = About(time.time(), site.origin_deg is not None, site.landmarks.names, camera, height_m)
+        self.opened = self.stack.enter_context(ExitStack())
+        streams = _open(self.opened, options.emit, self.about, health, self.live, "--emit")
+        self.folder = make_session_folder(options.out)
+        own = _open(self.opened, [f"json:{self.folder / RESULTS}"], self.about, health, self.live, "--out")
+        self.streams = [*own, *streams]
+        self.facts = self._describe_run()
+        log = SessionLog(self.folder, self.facts)
+        self.stack.callback(log.close)
+        shown = () if options.quiet else (print_event, print_snapshot)
+        self.status = StatusWriter(health, log, self.streams, self.live.status_s, *shown)
+        self.status.begin()
+
+    def _describe_run(self) -> dict[str, Any]:
+        options, ready, source = self.options, self.ready, self.source
         facts: dict[str, Any] = {
-            "input": name,
-            "telemetry": telemetry if reports is None else reports.name,
+            "input": self.name,
+            "telemetry": self.inputs.telemetry_name,
             "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
-            "interval_frames": interval,
-            "people": people,
+            "interval_frames": options.interval,
+            "people": options.people,
             "backend": ready.engine.name,
             "notes": list(ready.notes),
         }
-        if given is not None and ready.watch is not None:
+        if (given := self.inputs.given) is not None and ready.watch is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
-        facts |= {key: paths for key, paths in (("ground", ground), ("aerial", aerial)) if paths}
-        facts |= {"command": asdict(commanding)} if commanding is not None else {}
-        facts |= {} if detector is None else {"detector": detector.facts, "movers": movers}
+        facts |= {key: paths for key, paths in (("ground", options.ground), ("aerial", options.aerial)) if paths}
+        facts |= {"command": asdict(options.commanding)} if options.commanding is not None else {}
+        if options.detector is not None:
+            facts |= {"detector": options.detector.facts, "movers": options.movers}
         facts["settings"] = ready.settings.model_dump()
-        log = SessionLog(folder, facts)
-        stack.callback(log.close)
-        shown = () if quiet else (_print_event, _print_snapshot)
-        status = StatusWriter(health, log, streams, live.status_s, *shown)
-        status.begin()
-        watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
-        patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
-        pages |= health_pages(health, watchdog, streams, lambda: status.state, name, VERSION, patience_s, view)
+        return facts
 
-        feed = Feed(source, health, watchdog, flight)
-        feed.clock_offset_s = nan if is_recording else offset_s
-        if reports is not None and not is_recording:
-            feed.live, reports.clock_offset_s = reports, offset_s
-            feed.began = partial(_follow, reports, feed, given, settings, ready.notes)
-        if marks is not None:
-            feed.place_landmarks = lambda: marks.place(
-                feed.locator, source.start_utc_s - feed.clock_offset_s, source.rate_hz
-            )
-        if server is not None:
+    def begin(self) -> None:
+        """Connect the source with the path and the page, and start the threads that supervise the run."""
+        options, health, source, ready, stack = self.options, self.health, self.source, self.ready, self.stack
+        self.watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
+        patience_s = max(2 * self.live.stall_s, 30 / source.rate_hz)
+        self.pages |= health_pages(
+            *(health, self.watchdog, self.streams, lambda: self.status.state, self.name, VERSION, patience_s, self.view)
+        )
+        self.feed = feed = Feed(source, health, self.watchdog, ready.telemetry)
+        self.inputs.connect(feed, ready.notes)
+        if self.server is not None:
             ground_site = None if ready.watch is None else map_site(ready.watch.locator, None)
-            view.begin(interval, about, ground_site, zones.zones if zones else ())
-            feed.seen = view.take
+            self.view.begin(options.interval, self.about, ground_site, options.zones.zones if options.zones else ())
+            feed.seen = self.view.take
 
         def stop(number: int) -> None:
             """Take no further picture; the run ends when all taken pictures are finished."""
             feed.stop()
             source.stop()
 
-        signals = stack.enter_context(StopSignals(stop))
-        stack.enter_context(status)
-        stack.enter_context(watchdog)
-        if team is not None:
-            team.begin(folder)
-            stack.callback(team.finish)
-        supervisor.say("READY=1", "STATUS=running")
-        if not quiet:
-            _print("{}, {}x{} at {:g} Hz; into {}".format(source.name, *source.size, source.rate_hz, folder))
+        self.signals = stack.enter_context(StopSignals(stop))
+        stack.enter_context(self.status)
+        stack.enter_context(self.watchdog)
+        if self.team is not None:
+            self.team.begin(self.folder)
+            stack.callback(self.team.finish)
+        self.supervisor.say("READY=1", "STATUS=running")
+        if not options.quiet:
+            print_line("{}, {}x{} at {:g} Hz; into {}".format(source.name, *source.size, source.rate_hz, self.folder))
             for note in ready.notes:
-                _print(f"note: {note}")
-        if server is not None and not wait and (not quiet or server.access.is_made):
-            _print_page(server)
-        failure, tally = "", _Located()
-        counts = ZoneCounts(zones.zones if zones else ())
+                print_line(f"note: {note}")
+        if not options.wait:
+            self._print_page()
+
+    def _print_page(self) -> None:
+        if self.server is not None and (not self.options.quiet or self.server.access.is_made):
+            print_page(self.server)
+
+    # -- the run ------------------------------------------------------------------------------------------------------
+
+    def process(self) -> None:
+        """Process pictures until they end, the run is stopped, or the work fails repeatedly."""
+        zones = self.options.zones
+        self.counts = ZoneCounts(zones.zones if zones else ())
         if zones:
-            facts["zones"] = deepcopy(counts.rows)
+            self.facts["zones"] = deepcopy(self.counts.rows)
+        # For a recording, times of day come from its own log, if the log has a clock.
+        flight = self.ready.telemetry
+        recorded_utc_s = flight.start_utc_s if self.inputs.is_recording and flight is not None else nan
         try:
-            for located, seen in results(begin, feed, health):
-                located = located if team is None else team.add(located)
-                located = located if commands is None else commands.update(located, feed)
-                if events := (*located.events, *(zones.update(located) if zones else ())):
-                    located = replace(located, events=events)
-                    counts.add(events)
-                    facts |= deepcopy({"zones": counts.rows, "crowd_events": counts.crowds})  # another thread writes it
-                    for event in events:
-                        health.event("zone" if event.zone else "crowd", event.describe(), event.frame)
-                result = located, seen
-                if cause := tally.add(result[0]):
-                    health.event("locate", f"not located: {cause}", result[0].number)
-                about.start_utc_s = source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
-                send_result(result, streams, health)
-                record_result(result, feed, health, live.deadline_ms)
-                if server is not None:
-                    view.show(*result)
-            status.state = "complete" if signals.signal is None else "stopped"
+            with ResultWriter(self.streams, self.about, self.health, self.live.deadline_ms) as writer:
+                for located, people in results(self.path, self.feed, self.health):
+                    is_settled = not located.tracks.provisional
+                    located = self._add_events(located) if is_settled else located
+                    start_utc_s = self.source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
+                    newest = self.feed.newest
+                    writer.put((located, people), start_utc_s, nan if newest is None else newest.taken_s)
+                    if self.server is not None and is_settled:
+                        self.view.show(located, people)
+            self.status.state = "complete" if self.signals.signal is None else "stopped"
         except RepeatedFailure as error:
-            failure, status.state = str(error), "failed"
-            health.event("run", failure)
-        facts["notes"] += zones.notes if zones else []
-        facts["notes"] += team.finish() if team is not None else []
-        if ready.watch is not None and not tally.located:
-            facts["notes"].append(tally.describe())
-            health.event("locate", tally.describe())
-        supervisor.say("STOPPING=1")
-        opened.close()
-    if not quiet:
-        _print(_summarize(health, folder, live.deadline_ms))
-    elif failure:  # --quiet silences events, not errors
-        _print(failure)
-    lost = f"{RESULTS} lacks {streams[0].lost} lines" if streams[0].lost else ""
-    if refused := "; ".join(filter(None, (status.refused, lost))):
-        _print(f"{folder}: {refused}; free some space or choose another --out")
-    if failure or refused:
-        return HUNG if failure else UNWRITTEN
-    return 0 if signals.signal in (None, signal.SIGTERM) else 128 + signals.signal
+            self.failure, self.status.state = str(error), "failed"
+            self.health.event("run", self.failure)
 
+    def _add_events(self, located: FrameResult) -> FrameResult:
+        """Return a result with the records of other platforms, of commands and of zones."""
+        zones = self.options.zones
+        located = located if self.team is None else self.team.add(located)
+        located = located if self.commands is None else self.commands.update(located, self.feed)
+        if events := (*located.events, *(zones.update(located) if zones else ())):
+            located = replace(located, events=events)
+            self.counts.add(events)
+            # Another thread writes the record.
+            self.facts |= deepcopy({"zones": self.counts.rows, "crowd_events": self.counts.crowds})
+            for event in events:
+                self.health.event("zone" if event.zone else "crowd", event.describe(), event.frame)
+        if cause := self.tally.add(located):
+            self.health.event("locate", f"not located: {cause}", located.number)
+        return located
 
-def _follow(
-    reports: LiveTelemetry,
-    feed: Feed,
-    given: AerialInput | None,
-    settings: Settings,
-    notes: Sequence[str],
-    pipeline: Pipeline,
-) -> None:
-    """Complete live reports for the site of the locator; estimate the clock offset, unless it is given or known."""
-    if (locator := feed.locator) is None:
-        reports.begin(lambda log: (log, []), notes)
-        return
-    reports.begin(completion(given, settings, locator), notes)
-    if not is_set(settings, "aerial.clock_offset_s") and reports.name != KLV:
-        reports.measure = lambda: reports.estimate_clock_offset(locator, pipeline.motions)
+    def end(self) -> None:
+        """Complete the record, and close the streams."""
+        zones = self.options.zones
+        self.facts["notes"] += zones.notes if zones else []
+        self.facts["notes"] += self.team.finish() if self.team is not None else []
+        if self.ready.watch is not None and not self.tally.located:
+            self.facts["notes"].append(self.tally.describe())
+            self.health.event("locate", self.tally.describe())
+        self.supervisor.say("STOPPING=1")
+        self.opened.close()
+
+    def tell_end(self) -> int:
+        """Print the last lines, and return the exit code."""
+        if not self.options.quiet:
+            print_line(summarize(self.health, self.folder, self.live.deadline_ms))
+        elif self.failure:  # --quiet silences events, not errors
+            print_line(self.failure)
+        lost = f"{RESULTS} lacks {self.streams[0].lost} lines" if self.streams[0].lost else ""
+        if refused := "; ".join(filter(None, (self.status.refused, lost))):
+            print_line(f"{self.folder}: {refused}; free some space or choose another --out")
+        if self.failure or refused:
+            return HUNG if self.failure else UNWRITTEN
+        return 0 if self.signals.signal in (None, signal.SIGTERM) else 128 + self.signals.signal
 
 
 class _Located:
@@ -356,76 +386,6 @@ class _Located:
         return describe_nothing_located(self._causes, self._unplaced)
 
 
-def build_path(
-    ready: Assembly,
-    source: LiveSource,
-    people: bool,
-    interval: int,
-    backend: str,
-    health: Health,
-    prepare: Callable[[], Assembly],
-    detector: OnnxDetector | None = None,
-    movers: bool = False,
-) -> Callable[[Feed], Iterator[Result]]:
-    """Return the path from frames to results, which restarts at each call, and sheds load.
-
-    prepare: makes `ready` again for pictures of another size.
-    Raise InputError at once for pictures that are too small for people.
-    """
-    settings, scorer = ready.settings, None
-    if people:
-        # Searching the whole picture takes as long as many pictures take to arrive.
-        share = min(settings.people.look_share, 0.1)
-        settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
-        scorer = load_scorer(settings.people, backend)
-    shedding = LoadShedding(source, settings, health, people)
-    engines = iter([ready.engine])
-
-    def build_person_tracker(size: tuple[int, int]) -> PersonTracker | None:
-        if scorer is None:
-            return None
-        tracker = FrameTracker(shedding.settings, interval, size, pictures=False, rate_hz=source.rate_hz)
-        return PersonTracker(scorer, shedding.settings, interval, size, tracker)
-
-    watch, watch_size = ready.watch, source.size
-    build_person_tracker(watch_size)
-
-    def begin(feed: Feed) -> Iterator[Result]:
-        # After an error, no object that remembers a frame is used again.
-        nonlocal watch, watch_size
-        if watch is not None and feed.size != watch_size:  # the camera model depends on the size
-            watch, watch_size = prepare().watch, feed.size
-        engine = next(engines, None) or load_engine(backend, shedding.settings)
-        person_tracker = build_person_tracker(feed.size)
-
-        def retune(frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:
-            settings, adjustments = shedding(frame)
-            if person_tracker is not None and adjustments:
-                person_tracker.retune(settings)
-            return settings, adjustments
-
-        running = None if watch is None else watch.restarted()
-        feed.locator = None if running is None else running.locator
-        if running is not None and feed.log is not None:
-            locator = running.locator
-            feed.aligned = lambda log: locator.set_site(replace(locator.site, telemetry=log))
-            feed.aligned(feed.log)
-        pipeline = Pipeline.from_assembly(
-            Assembly(shedding.settings, engine, None, running),
-            interval=interval,
-            seen=None if person_tracker is None else person_tracker.update,
-            retune=retune,
-            pictures=False,
-            detector=detector,
-            movers=movers,
-        )
-        feed.began(pipeline)
-        for result in pipeline(feed):
-            yield result, None if person_tracker is None else person_tracker.people_of(result.number, feed.ended)
-
-    return begin
-
-
 def _open(
     opened: ExitStack, texts: Sequence[str], about: About, health: Health, live: LiveParameters, option: str
 ) -> list[Stream]:
@@ -435,44 +395,3 @@ def _open(
         opened.callback(stream.close)
         health.ask(stream.trouble)
     return streams
-
-
-# Messages go to stderr, because stdout is for streams.
-
-
-def _print(text: str) -> None:
-    clear = _CLEAR if sys.stderr.isatty() else ""
-    sys.stderr.write(f"{clear}dddas: {printable(' '.join(text.split()))}\n")
-    sys.stderr.flush()
-
-
-def _print_page(server: HealthServer) -> None:
-    _print(f"status page: {server.url}")
-
-
-def _print_event(event: Event) -> None:
-    _print(f"frame {event.frame}: {event.text}" if event.frame else event.text)
-
-
-def _print_snapshot(now: Snapshot) -> None:
-    """Replace the previous line by the state in one line; do nothing if stderr is not a terminal."""
-    if not sys.stderr.isatty():
-        return
-    latency = f", latency {1000 * now.seconds['latency'][0]:.0f} ms" if "latency" in now.seconds else ""
-    counts, gauges = now.counts, now.gauges
-    line = (
-        f"{gauges.get('rate_hz', 0.0):.1f} results/s{latency}, {gauges.get('targets', 0):g} targets, "
-        f"{counts.get('dropped', 0)} of {counts.get('captured', 0)} pictures dropped"
-    )
-    sys.stderr.write(f"{_CLEAR}{line}")
-    sys.stderr.flush()
-
-
-def _summarize(health: Health, folder: Path, deadline_ms: float) -> str:
-    now = health.snapshot()
-    counts = {name: now.counts.get(name, 0) for name in ("results", "captured", "dropped", "late")}
-    within = f", 99 % within {1000 * now.seconds['latency'][2]:.0f} ms" if "latency" in now.seconds else ""
-    return (
-        f"{counts['results']} results of {counts['captured']} pictures, {counts['dropped']} dropped, "
-        f"{counts['late']} late (over {deadline_ms:g} ms){within}; {folder}"
-    )

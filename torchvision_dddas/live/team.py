@@ -26,6 +26,7 @@ from torchvision_dddas.io.platform_files import Platform, PlatformFile, read_aer
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.receiver import DeadCamera
+from torchvision_dddas.live.run_path import build_path
 from torchvision_dddas.live.runner import Feed, RepeatedFailure, results
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.pipeline import prepare_uav
@@ -199,7 +200,6 @@ class LiveTeam:
 
     def _see(self, one: Platform) -> Iterator[PlatformLook]:
         """Yield the looks of a platform. Wait for a stream that is missing or lost."""
-        from torchvision_dddas.live.session import build_path  # imported here, because it imports this module
 
         def wait() -> None:
             if self._ended.is_set():

@@ -156,6 +156,7 @@ class Pipeline:
         self._seen: Callable[[Scene], object] | None = None
         self._retune: Retune | None = None
         self._pictures = True
+        self._lag: int | None = None
         self._own_detector, self._movers = detector, movers
         self._ground, self._aerial = ([x] if isinstance(x, str | Path) else list(x) for x in (ground, aerial))
         self._team: GroundTeam | None = None
@@ -172,15 +173,17 @@ class Pipeline:
         pictures: bool = True,
         detector: Detector | DetectionTable | None = None,
         movers: bool = False,
+        lag: int | None = None,
     ) -> "Pipeline":
         """Make a pipeline from assembled parts, for one clip.
 
         seen: called with each scene, without its landmarks. retune: as for `detect_motion`. pictures: whether results
-        keep their pictures, which take most of a long run's memory. detector, movers: as for `Pipeline`.
+        keep their pictures, which take most of a long run's memory. detector, movers: as for `Pipeline`. lag: as for
+        `Tracker`; results with provisional tracks have no places.
         """
         pipeline = cls(assembly.settings, interval=interval, detector=detector, movers=movers)
         pipeline._assembly = assembly
-        pipeline._seen, pipeline._retune, pipeline._pictures = seen, retune, pictures
+        pipeline._seen, pipeline._retune, pipeline._pictures, pipeline._lag = seen, retune, pictures, lag
         return pipeline
 
     def __call__(self, source: "str | Path | ClipSource | Iterable[Frame | np.ndarray]") -> Iterator[FrameResult]:
@@ -261,7 +264,9 @@ class Pipeline:
         if (own := self._own_detector) is not None:
             kind = (own.own, own.certain) if isinstance(own, DetectionTable) else (None, False)
         self._moving_boxes = None if own is None or not self._movers else MovingBoxes(own, self.interval)
-        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures, backend, rate_hz, *kind)
+        self._tracker = SceneTracker(
+            self.settings, self.interval, size_px, self._pictures, backend, rate_hz, *kind, self._lag
+        )
         join_m = self.settings.crowds.join_m if self._watch is not None else 0.0
         self._crowds = (CrowdIdentities(), CrowdEvents(join_m)) if join_m else None
         self._waiting: dict[int, WatchedScene] = {}
@@ -294,7 +299,7 @@ class Pipeline:
         if self._seen is not None:
             self._seen(scene)
         for tracked in self._tracker.update(scene):
-            yield self._finish(tracked)
+            yield FrameResult(tracked) if tracked.tracks.provisional else self._finish(tracked)
 
     def _rest(self) -> Iterator[FrameResult]:
         waiting = deque(self._tracker.flush())

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import load_assignment_solver
 from torchvision_dddas.tracking.assignment import choose_triplets, least_loss, relaxed_shares
 from torchvision_dddas.types import Bool, Float, Int
 
@@ -275,11 +276,9 @@ def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndar
 
 def _match(best: Float[np.ndarray, "A B"]) -> tuple[np.ndarray, ...]:
     """Return gains of lone targets (A,) and (B,), the extra gains of pairs (A, B), and the best pairs (P,), (P,)."""
-    from scipy.optimize import linear_sum_assignment  # imported here: it takes half a second and 45 MB
-
     first, second = np.maximum(best[1:, 0], 0.0), np.maximum(best[0, 1:], 0.0)
     excess = np.maximum(best[1:, 1:] - first[:, None] - second, 0.0)
-    return first, second, excess, *linear_sum_assignment(excess, maximize=True)
+    return first, second, excess, *load_assignment_solver()(excess, maximize=True)
 
 
 def _least_potential(excess: np.ndarray, row: np.ndarray, column: np.ndarray) -> Float[np.ndarray, "B"]:
@@ -429,15 +428,13 @@ def _improve(gain: Gain, chosen: Triplets) -> Triplets:
 
 def _reassign(gain: Gain, pairs: Int[np.ndarray, "P 2"], layer: int) -> Triplets:
     """Return the best choice of triplets that keeps the given pairs, or lone targets, of the other two layers."""
-    from scipy.optimize import linear_sum_assignment  # imported here: it takes half a second and 45 MB
-
     pairs = add_lone_targets(pairs[(pairs > 0).all(axis=1)], [gain.shape[other] for other in _OTHERS[layer]])
     group = np.insert(pairs, layer, 0, axis=1)
     where = list(group.T)
     where[layer] = np.arange(gain.shape[layer])[:, None]
     worth = gain[tuple(where)]
     without = np.maximum(worth[0], 0.0)
-    target, place = linear_sum_assignment(np.maximum(worth[1:] - without, 0.0), maximize=True)
+    target, place = load_assignment_solver()(np.maximum(worth[1:] - without, 0.0), maximize=True)
     better = worth[1 + target, place] > without[place]
     group[place[better], layer] = target[better] + 1
     return group[gain[tuple(group.T)] > 0]

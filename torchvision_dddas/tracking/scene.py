@@ -6,6 +6,7 @@ move by a share of their height from one look to the next, and that share is est
 
 import math
 from collections import deque
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +52,12 @@ class SceneStatistics:
         self._near, self._far = np.full(2, np.inf), np.full(2, -np.inf)  # corners of all boxes so far
         self._missed = self._links = 0.0
         self._births = self._seen = 0
+
+    def copy(self) -> "SceneStatistics":
+        """Return a copy that changes on its own."""
+        other = copy(self)
+        other._steps, other._changes, other._counts = copy(self._steps), copy(self._changes), copy(self._counts)
+        return other
 
     def add_look(self, before_px: np.ndarray | None, now_px: np.ndarray, gap: float) -> None:
         """Add the boxes (N, 4) and (M, 4) of two successive looks, in the same coordinates, `gap` looks apart.

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -82,7 +83,8 @@ class _Sample:
     row: (M,) index of each in the frame's detections. begins: (M,) whether a detection may begin a track. step: (3, 3)
     camera motion from the frame before, or None. appearance: returns the histograms of all detections. time: time in
     looks. look: number of the look. examined: why the histograms were computed, "" until then. signature: the (M, D)
-    histograms, (M, 0) until they are computed. visible: visible share of each box.
+    histograms, (M, 0) until they are computed. visible: visible share of each box. begun: numbers of the tracks that
+    detections began, by detection; a provisional track keeps its number.
     """
 
     frame: int
@@ -96,6 +98,7 @@ class _Sample:
     look: int
     damaged: bool = False
     examined: str = ""
+    begun: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.signature, self.visible = np.zeros((len(self.row), 0), np.float32), np.ones(len(self.row))
@@ -106,6 +109,39 @@ class _Sample:
             self.examined = cause
             self.signature, self.visible = self.appearance()[self.row], visible_shares(self.box_px)
         self.appearance = None
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The links of a frame, and the tracks that it begins.
+
+    tracks, detections: (K,) indices of linked tracks and detections. continued: these tracks after their links. link:
+    (K,) confidences. begun, new: tracks that begin, and their detections. at_border: (M,) whether a detection is at the
+    picture's border.
+    """
+
+    tracks: np.ndarray
+    detections: np.ndarray
+    continued: TrackStates
+    link: np.ndarray
+    begun: TrackStates
+    new: np.ndarray
+    at_border: np.ndarray
+
+    @property
+    def number(self) -> np.ndarray:
+        """The numbers of all tracks in the frame."""
+        return np.concatenate([self.continued.number, self.begun.number])
+
+    @property
+    def at(self) -> np.ndarray:
+        """Their detections."""
+        return np.concatenate([self.detections, self.new])
+
+    @property
+    def links(self) -> np.ndarray:
+        """The confidences of their links, NaN where a track begins."""
+        return np.concatenate([self.link, np.full(len(self.new), np.nan)])
 
 
 class DoubtRule:
@@ -134,22 +170,29 @@ class ScoreTracker:
     """
 
     def __init__(
-        self, settings: Settings, interval: int, size: tuple[float, float] | None = None, confirmed: bool = False
+        self,
+        settings: Settings,
+        interval: int,
+        size: tuple[float, float] | None = None,
+        confirmed: bool = False,
+        by_birth: bool = False,
     ) -> None:
         """Start without tracks.
 
         interval: usual number of frames between fed frames. size: (width, height) of the picture, None if unknown.
-        confirmed: whether the detector has confirmed its detections over several frames.
+        confirmed: whether the detector has confirmed its detections over several frames. by_birth: give identities as
+        `FixedLagSmoother` does, so that those of `preview` stay.
         """
         self.parameters, self.interval, self.size = settings.track, interval, size
         self.scene = SceneStatistics(size)
         self.tracks = TrackStates()
         self.flow = self.tracks.state  # states of recent tracks, whose velocities show how targets move
         self.common_velocity = np.zeros(2)  # their common velocity, pixels a look
-        self.smoother = FixedLagSmoother(self.parameters.hits, self.parameters.smooth, interval)
+        self.smoother = FixedLagSmoother(self.parameters.hits, self.parameters.smooth, interval, by_birth)
         self.begun = self._looks = 0
         self._before: _Sample | None = None
         self._waiting: _Sample | None = None
+        self._decided: tuple[_Sample, _Choice] | None = None  # the frame that was decided last
         self._doubts = DoubtRule(settings.track)
         self._confirmed = confirmed
         self._least = max(1, -(-settings.track.hits // interval)) if confirmed else 1
@@ -195,13 +238,37 @@ class ScoreTracker:
             self._waiting = None
         return self._settle(everything=True)
 
+    def preview(self) -> Tracks:
+        """Return the provisional tracks of the frame fed last, without its successor. They have the detections' boxes.
+
+        Histograms are used only if another frame needed them. The next call of `feed` is not affected.
+        """
+        if self._waiting is None:
+            assert self._decided is not None
+            now, chosen = self._decided
+        else:
+            trial, now = copy(self), copy(self._waiting)
+            trial.scene, trial._uses, now.appearance = self.scene.copy(), {}, None
+            chosen = trial._choose(now, None)
+            self.begun = trial.begun
+        at, number = chosen.at, chosen.number
+        return Tracks(
+            *(now.frame, number + 1, now.box_px[at], now.score[at], now.row[at], chosen.links), provisional=True
+        )
+
     def _settle(self, everything: bool = False) -> list[Tracks]:
         settled = self.smoother.settle(everything)
         uses = (self._uses.pop(tracks.frame, None) for tracks in settled)
         return [replace(tracks, appearance=use) if use else tracks for tracks, use in zip(settled, uses, strict=True)]
 
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
-        """Link a frame's detections to the tracks. ahead: the next frame, if it is known."""
+        """Link a frame's detections to the tracks, and update the tracks. ahead: the next frame, if it is known."""
+        chosen = self._choose(now, ahead)
+        self._commit(now, chosen)
+        self._before, self._decided = now, (now, chosen)
+
+    def _choose(self, now: _Sample, ahead: _Sample | None) -> _Choice:
+        """Choose the links of a frame's detections to the tracks, in the coordinates of the frame."""
         box, parameters = now.box_px, self.parameters
         self._follow_camera(now)
         score = self._scores(self.tracks, now, box)
@@ -232,8 +299,8 @@ class ScoreTracker:
             best = best_pairs(score)
             chosen = np.isin(tracks * count + detections, best[:, 0] * count + best[:, 1])
         link = link_confidences(score, tracks[chosen], detections[chosen])
-        self._commit(now, tracks[chosen], detections[chosen], continued[chosen], link, born, at_border)
-        self._before = now
+        begun, new = self._begin(now, tracks[chosen], detections[chosen], born)
+        return _Choice(tracks[chosen], detections[chosen], continued[chosen], link, begun, new, at_border)
 
     def _follow_camera(self, now: _Sample) -> None:
         """Transform the tracks to the coordinates of a frame, and add its boxes to the scene statistics."""
@@ -312,33 +379,32 @@ class ScoreTracker:
         offset = np.abs((now.box_px[:, :2] + now.box_px[:, 2:] / 2)[:, None] - later[:, X : Y + 1])
         return np.asarray((offset <= later[:, WIDTH : HEIGHT + 1] / 2).all(axis=2).any(axis=1))
 
-    def _commit(
-        self,
-        now: _Sample,
-        tracks: np.ndarray,
-        detections: np.ndarray,
-        continued: TrackStates,
-        link: np.ndarray,
-        born: TrackStates,
-        at_border: np.ndarray,
-    ) -> None:
-        """Link tracks (K,), now `continued`, to detections (K,), begin new tracks, and drop old tracks."""
+    def _begin(
+        self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, born: TrackStates
+    ) -> tuple[TrackStates, np.ndarray]:
+        """Return the tracks that free detections begin, and these detections. born: a track of each detection."""
         is_free = np.ones(len(now.row), bool)
         is_free[detections] = False
         if self._confirmed:
             is_free &= ~self._is_part(now, tracks)
         new = np.flatnonzero(is_free & now.begins)
-        begun = replace(born[new], number=self.begun + np.arange(len(new)))
-        self.begun += len(begun)
+        for detection in new.tolist():
+            if detection not in now.begun:
+                now.begun[detection] = self.begun
+                self.begun += 1
+        return replace(born[new], number=np.array([now.begun[k] for k in new.tolist()], np.int64)), new
+
+    def _commit(self, now: _Sample, chosen: _Choice) -> None:
+        """Take over the links and new tracks of a frame, and drop old tracks."""
+        tracks, new, begun, at_border = chosen.tracks, chosen.new, chosen.begun, chosen.at_border
         births = 0 if self._before is None else int((~at_border[new]).sum())
         self.scene.add_links(now.look - self.tracks.look[tracks] - 1, births)
         unseen = np.ones(len(self.tracks), bool)
         unseen[tracks] = False
-        self.tracks = _join(self.tracks[unseen], continued, begun)
-        number, at = np.concatenate([continued.number, begun.number]), np.concatenate([detections, new])
-        link = np.concatenate([link, np.full(len(new), np.nan)])
+        self.tracks, at = _join(self.tracks[unseen], chosen.continued, begun), chosen.at
         self.smoother.add(
-            *(now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step, link, self._trusts_single),
+            *(now.frame, chosen.number, now.box_px[at], now.score[at], now.row[at], now.step, chosen.links),
+            trusts_single=self._trusts_single,
             least=_DAMAGED_HITS if now.damaged else self._least,
         )
         looks = now.look - self.tracks.look

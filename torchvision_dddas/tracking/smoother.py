@@ -44,13 +44,14 @@ class _Pending:
 class FixedLagSmoother:
     """Delays each sampled frame by a fixed number of sampled frames. `settle` returns the frames that are due."""
 
-    def __init__(self, hits: int, smooth: bool, interval: int = 1) -> None:
+    def __init__(self, hits: int, smooth: bool, interval: int = 1, by_birth: bool = False) -> None:
         """Start without frames.
 
         hits: detections that confirm a track. smooth: smooth the boxes with a score below 1 along their track.
-        interval: frames from one sampled frame to the next.
+        interval: frames from one sampled frame to the next. by_birth: give identities by the tracks' own numbers, which
+        are known before a track is confirmed; else count the confirmed tracks.
         """
-        self.hits, self.smooth, self.interval = hits, smooth, interval
+        self.hits, self.smooth, self.interval, self.by_birth = hits, smooth, interval, by_birth
         self.pending: deque[_Pending] = deque()
         self.count = 0  # number of sampled frames so far
         self.delay = hits - 1 + FILLED  # number of sampled frames by which a frame is delayed
@@ -128,7 +129,7 @@ class FixedLagSmoother:
             for number in confirmed:
                 if number not in self.identities:
                     self.identity_count += 1
-                    self.identities[number] = self.identity_count
+                    self.identities[number] = number + 1 if self.by_birth else self.identity_count
             done.append(
                 Tracks(
                     pending.frame,

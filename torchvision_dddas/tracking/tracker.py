@@ -59,6 +59,14 @@ class Tracker:
     >>> tracks += tracker.flush()
     >>> len(tracks), tracks[-1].id, tracks[-1].xyxy.round()
     (12, array([1]), array([[133.,  50., 173., 130.]]))
+
+    With `lag=0`, the last record of each update has the provisional tracks of the frame itself:
+
+    >>> tracker = td.Tracker(size=(640, 480), lag=0)
+    >>> for k in range(6):
+    ...     tracks = tracker.update((np.array([[100.0 + 3 * k, 50, 40, 80]]), np.array([0.9])))
+    >>> [(each.frame, each.provisional, each.id.tolist(), each.corrects) for each in tracks]
+    [(1, False, [1], ()), (6, True, [1], ())]
     """
 
     def __init__(
@@ -71,6 +79,7 @@ class Tracker:
         certain: bool = False,
         backend: str = "onboard",
         rate_hz: float | None = None,
+        lag: int | None = None,
     ) -> None:
         """Start without tracks.
 
@@ -79,22 +88,34 @@ class Tracker:
         `track.own_scatter` applies to their boxes; None: decide by the kind of the first detections. certain: count
         every score as 1. backend: with torch, the source's association (`track.mode = paper`) computes the histograms
         and affinities of several frames at once, and settles these frames together; auto is torch if there is a CUDA
-        device. The default association ignores it. rate_hz: frames a second, needed if `update` gets times.
-        Raises InputError for an interval below 1, a size that is not two positive numbers, and as `wants_torch`.
+        device. The default association ignores it. rate_hz: frames a second, needed if `update` gets times. lag: with
+        0, `update` also returns the tracks of its own frame, last and marked as `provisional`. The settled record of
+        the frame comes later, and its `corrects` names the provisional identities that were wrong. Identities then have
+        gaps, because tracks that are never confirmed have numbers too. None: only settled frames.
+        Raises InputError for an interval below 1, a size that is not two positive numbers, another lag, lag with the
+        source's association in torch, and as `wants_torch`.
         """
         if not isinstance(interval, int | np.integer) or interval < 1:
             raise InputError(f"interval must be a whole number of frames from 1, got {interval}")
         if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
             raise InputError(f"size must be (width, height) in pixels, got {size}")
         self.settings, self.interval, self.size = check_settings(settings), int(interval), size
-        self._motion, self._certain, self._rate_hz = motion, certain, rate_hz
+        if lag not in (None, 0):
+            raise InputError(f"lag must be 0 (provisional tracks at once) or None (settled tracks only), got {lag!r}")
+        self._motion, self._certain, self._rate_hz, self._lag = motion, certain, rate_hz, lag
         self._in_batches = self.settings.track.mode == "paper" and wants_torch(backend)
+        if self._in_batches and lag is not None:
+            raise InputError(
+                "lag=0 cannot work with track.mode = paper in torch, which settles frames in batches; "
+                "take backend='onboard'"
+            )
         self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None
         self._frame: int | None = None
         self._time_s, self._at = math.nan, math.nan  # time of the last frame, and its number at a constant rate
         self._tried = np.zeros((0, 4))  # the first boxes given as arrays, to check their order of coordinates
         self._given: deque[Detections] = deque()  # detections of the frames that are not settled
+        self._told: dict[int, Tracks] = {}  # provisional tracks of these frames, by frame
         self._classes: dict[int, tuple[str, int]] = {}  # class of the latest detection, by identity
 
     def update(
@@ -110,12 +131,13 @@ class Tracker:
     ) -> list[Tracks]:
         """Add the detections of the next sampled frame, and return the frames that are now settled.
 
-        detections: a Detections record, (N, 4) boxes x, y, width, height in pixels, or a tuple of boxes and (N,)
-        scores. camera_motion: (3, 3) pixel homography from the frame before; None if the camera stood still or its
-        motion is unknown. image: (H, W, 3) uint8 BGR or (H, W) grey, needed for the use of appearance. frame: the frame
-        number; None: the last number plus the interval, from 1. interval: frames since the frame before, if not the
-        usual interval. time_s: time of the frame, if the frame rate is not constant; it is used for prediction.
-        damaged: see Frame; targets that first appear in a damaged frame need more detections.
+        With lag=0, the provisional tracks of this frame come last. detections: a Detections record, (N, 4) boxes x, y,
+        width, height in pixels, or a tuple of boxes and (N,) scores. camera_motion: (3, 3) pixel homography from the
+        frame before; None if the camera stood still or its motion is unknown. image: (H, W, 3) uint8 BGR or (H, W)
+        grey, needed for the use of appearance. frame: the frame number; None: the last number plus the interval, from
+        1. interval: frames since the frame before, if not the usual interval. time_s: time of the frame, if the frame
+        rate is not constant; it is used for prediction. damaged: see Frame; targets that first appear in a damaged
+        frame need more detections.
         Raises InputError for other shapes, boxes without a size, values that are not finite, and a frame number that is
         not above the last number.
         """
@@ -151,13 +173,15 @@ class Tracker:
             elif track.mode == "paper":
                 self._tracker = SourceTracker(settings, self.interval, self.size)
             else:
-                self._tracker = ScoreTracker(settings, self.interval, self.size, confirmed=self._motion)
+                is_told = self._lag is not None
+                self._tracker = ScoreTracker(settings, self.interval, self.size, self._motion, by_birth=is_told)
         self._given.append(detections)
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))
         appearance = None if image is None else self._histograms(image, detections.box_px)
         if isinstance(self._tracker, ScoreTracker):
-            return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance, self._at, damaged))
+            settled = self._tracker.feed(number, detections, camera_motion, appearance, self._at, damaged)
+            return [*self._as_given(settled), *([] if self._lag is None else [self._preview()])]
         return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
@@ -193,6 +217,15 @@ class Tracker:
 
         return compute
 
+    def _preview(self) -> Tracks:
+        """Return the provisional tracks of the frame added last."""
+        assert isinstance(self._tracker, ScoreTracker)
+        tracks, given = self._tracker.preview(), self._given[-1]
+        row = tracks.row
+        classes = {"label": given.label[row], "class_id": given.class_id[row]}
+        self._told[tracks.frame] = tracks = replace(tracks, score=given.score[row], **classes)
+        return tracks
+
     def _as_given(self, settled: list[Tracks]) -> list[Tracks]:
         """Return the tracks with the scores and classes of their detections. Filled gaps have the last known class."""
         found = []
@@ -210,6 +243,10 @@ class Tracker:
             label = np.array([name for name, _ in classes], object)
             number = np.array([number for _, number in classes], np.int64)
             found.append(replace(tracks, score=score, label=label, class_id=number))
+            if (told := self._told.pop(tracks.frame, None)) is not None:
+                rows = dict(zip(tracks.identity.tolist(), tracks.row.tolist(), strict=True))
+                before = zip(told.identity.tolist(), told.row.tolist(), strict=True)
+                found[-1] = replace(found[-1], corrects=tuple(k for k, row in before if rows.get(k) != row))
         return found
 
 
@@ -248,11 +285,19 @@ class FrameTracker:
         pictures: bool = True,
         backend: str = "onboard",
         rate_hz: float | None = None,
+        lag: int | None = None,
     ) -> None:
         """Like Tracker. pictures: whether settled frames keep their pictures, which take most of the memory."""
         self.interval, self.pictures = interval, pictures
         self.tracker = Tracker(
-            settings, interval=interval, size=size, motion=motion, certain=certain, backend=backend, rate_hz=rate_hz
+            settings,
+            interval=interval,
+            size=size,
+            motion=motion,
+            certain=certain,
+            backend=backend,
+            rate_hz=rate_hz,
+            lag=lag,
         )
         self._waiting: deque[list[TrackedFrame]] = deque()  # frames that are not settled, each with its repeats
         self._settled: TrackedFrame | None = None  # the frame that was settled last
@@ -264,9 +309,9 @@ class FrameTracker:
         }
 
     def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
-        """Add a frame without tracks, and yield the frames that are now settled.
+        """Add a frame without tracks, and yield the frames that are now settled, and with lag=0 the frame itself.
 
-        A frame that repeats the frame added before is not tracked; it gets a copy of that frame's tracks.
+        A frame that repeats the frame added before is not tracked; it gets a copy of that frame's settled tracks.
         """
         if given.repeats and given.repeats == self._picture:
             if self._waiting:
@@ -299,6 +344,9 @@ class FrameTracker:
 
     def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
         for tracks in settled:
+            if tracks.provisional:  # its adjustments come with the settled frame
+                yield replace(self._waiting[-1][0], tracks=tracks, adjustments=())
+                continue
             given, *repeats = self._waiting.popleft()
             self._settled = replace(given, tracks=tracks, adjustments=given.adjustments + self._changes(tracks))
             yield self._settled
@@ -344,10 +392,11 @@ class SceneTracker:
         rate_hz: float | None = None,
         motion: bool | None = True,
         certain: bool = False,
+        lag: int | None = None,
     ) -> None:
         """Start without scenes. The arguments are those of FrameTracker; the default is motion = True."""
         self._interval = interval
-        self._tracker = FrameTracker(settings, interval, size, motion, certain, pictures, backend, rate_hz)
+        self._tracker = FrameTracker(settings, interval, size, motion, certain, pictures, backend, rate_hz, lag)
         self._steps: list[np.ndarray] = []
         self._adjustments: tuple[Adjustment, ...] = ()
         self._seconds: dict[str, float] = {}

@@ -42,7 +42,9 @@ class Tracks(Boxes):
     identity, and not to another identity that could have taken it. NaN for the first box of a track, for a bridging
     box, and if unknown. label, class_id: of the detection; a bridging box keeps its identity's earlier class.
     frame: number of the frame; (N,) in a table that `concat` has joined. appearance: whether it was used; None if there
-    was no choice: nothing to link, or no picture.
+    was no choice: nothing to link, or no picture. provisional: whether later frames may change the tracks, as those of
+    `Tracker(lag=0)` at once. corrects: the identities of the provisional tracks of this frame that are gone, or belong
+    to another box.
 
     >>> box_px = np.array([[10.0, 20, 5, 9], [40, 20, 5, 9]])
     >>> tracks = td.Tracks(3, np.array([7, 9]), box_px, np.ones(2), np.array([0, 1]))
@@ -61,6 +63,8 @@ class Tracks(Boxes):
     appearance: AppearanceUse | None = None
     label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
     class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    provisional: bool = False
+    corrects: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         complete_table(self, len(self.identity), link=np.nan, label="", class_id=-1)

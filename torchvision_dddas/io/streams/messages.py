@@ -14,7 +14,15 @@ from torchvision_dddas.io.maps.ground_tracks import iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
 from torchvision_dddas.io.output.zone_events import event_fields
 from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
-from torchvision_dddas.types import AerialLocations, AppearanceUse, Camera, FrameResult, FusedTargets, TrackedFrame
+from torchvision_dddas.types import (
+    AerialLocations,
+    AppearanceUse,
+    Camera,
+    FrameResult,
+    FusedTargets,
+    TrackedFrame,
+    Tracks,
+)
 
 PEOPLE_FROM = 1_000_000
 """Added to the identities of people, which are separate from those of targets: MOT text has no column for a kind."""
@@ -106,9 +114,17 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
             }
             for one in dict.fromkeys(adjustments)
         ],
+        **({} if result is None else _correction(result.tracks)),
         **({} if result is None or result.fused is None else {"fused": _fused(result.fused)}),
         **({"events": [event_fields(event, about.start_utc_s) for event in events]} if events else {}),
     }
+
+
+def _correction(tracks: Tracks) -> dict[str, Any]:
+    """Return the mark of provisional tracks, or the provisional identities that settled tracks correct."""
+    if tracks.provisional:
+        return {"provisional": True}
+    return {"corrects": list(tracks.corrects)} if tracks.corrects else {}
 
 
 def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
@@ -222,7 +238,8 @@ def _encode(fields: dict[str, Any]) -> bytes:
 def _split(fields: dict[str, Any], most_bytes: int) -> list[bytes]:
     """Return the fields in several lines; fields of the whole frame are in the first."""
     lists = {name: fields[name] for name in ("targets", "people")}
-    rest = {name: fields[name] for name in ("frame", "time_s", "utc", "age_s", "cause")}
+    common = ("frame", "time_s", "utc", "age_s", "cause", "provisional")
+    rest = {name: fields[name] for name in common if name in fields}
 
     def empty() -> dict[str, Any]:
         return {name: None if rows is None else [] for name, rows in lists.items()} | {"part": 10**6, "parts": 10**6}
@@ -245,9 +262,11 @@ def mot_lines(
 ) -> list[bytes]:
     """Return `frame,identity,x,y,width,height,score,-1,-1,-1`, a line a box with an identity: targets, then people.
 
-    One message per frame, or several of whole lines if it is longer than most_bytes. Infinite boxes are left out.
+    One message per frame, or several of whole lines if it is longer than most_bytes. Infinite boxes are left out, and
+    so are provisional tracks, which the text cannot mark.
     """
     text = ""
+    result = None if result is not None and result.tracks.provisional else result
     for tracked, first in ((None if result is None else result.tracked, 0), (people, PEOPLE_FROM)):
         if tracked is not None:
             tracks = tracked.tracks
