@@ -39,7 +39,7 @@ OPEN = {
     "io": "atomic_files camera_files colour_files detection_tables drawing elevation foreign_boxes ground_tables "
     "images interrupts joined_clips live_streams maps.formats maps.ground_tracks maps.map_picture mavlink_link output "
     "overlay overlay_video report report.charts report.figure_files report.table_files platform_files sources streams "
-    "tables telemetry track_files zone_files",
+    "tables telemetry track_files video_packets zone_files",
     "lab.evaluation": "datasets.record evaluate metrics.matching metrics.registry metrics.truth simulated_run "
     "studies.cache studies.comparison studies.jobs studies.kept studies.methods studies.records studies.runner "
     "studies.scoring studies.stages studies.summary studies.sweep",

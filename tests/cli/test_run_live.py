@@ -186,6 +186,61 @@ def test_sigterm_ends_a_run_and_one_that_waits_for_its_camera_with_valid_outputs
     assert not (tmp_path / "out").exists() if waits else session(tmp_path / "out")[1]["state"] == "stopped"
 
 
+def pixel_zone(folder):
+    ring = [[0, 0], [200, 0], [200, 180], [0, 180], [0, 0]]
+    shape = {"type": "Feature", "properties": {"name": "left"}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    path = folder / "zones.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "unit": "px", "features": [shape]}))
+    return path
+
+
+def test_the_annotated_pictures_are_saved_cut_and_sent_on(dddas, frames, tmp_path):
+    pytest.importorskip("av")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        receiver.bind(("127.0.0.1", 0))
+        words = ("--save", "all", "--zones", pixel_zone(tmp_path), "--set", "live.clip_s=0.3")
+        stream = f"video:udp://127.0.0.1:{receiver.getsockname()[1]}"
+        done = dddas("run", frames, *FAST, *words, "--emit", stream, "--out", tmp_path / "out", "--quiet")
+        assert receiver.recv(1 << 16)[0] == 0x47
+    assert (done.exit_code, done.output) == (0, "")
+    folder, record, _ = session(tmp_path / "out")
+    videos = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.mp4"))
+    assert videos[-1] == "overlay.mp4" and videos[0].startswith("clips/") and record["save"] == ["overlay", "clips"]
+    for name in videos:
+        capture, count = cv2.VideoCapture(str(folder / name)), 0
+        while capture.read()[0]:
+            count += 1
+        assert count == FRAMES if name == "overlay.mp4" else 0 < count < FRAMES
+
+
+def test_a_recording_that_is_not_possible_is_refused_at_the_start(dddas, frames, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert "--save must name some of overlay, clips" in bad(dddas("run", frames, *FAST, "--save", "map", "--out", out))
+    monkeypatch.setitem(sys.modules, "av", None)
+    for words in (("--save", "clips"), ("--emit", "video:udp://127.0.0.1:9")):
+        assert "needs PyAV" in bad(dddas("run", frames, *FAST, *words, "--out", out))
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_keeps_its_overlay(frames, tmp_path):
+    pytest.importorskip("av")
+    main, out = "from torchvision_dddas.cli import main; main()", tmp_path / "out"
+    words = [sys.executable, "-c", main, "run", str(frames), "--live", "--set", "live.pace=0.2", "--save", "overlay"]
+    with subprocess.Popen([*words, "--out", str(out)], stderr=subprocess.PIPE) as run:
+        end_s = time.monotonic() + 120
+        while not list(out.glob("*/.overlay.*.part.mp4")):
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        run.send_signal(signal.SIGINT)
+        run.communicate(timeout=120)
+    assert run.returncode == 130
+    folder = session(out)[0]
+    assert [path.name for path in folder.glob("*.mp4")] == ["overlay.mp4"] and not list(folder.glob(".*.part*"))
+    assert cv2.VideoCapture(str(folder / "overlay.mp4")).read()[0]
+
+
 def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -149,6 +149,13 @@ def test_save_none_leaves_the_tables_alone(again, tmp_path):
     assert (tmp_path / "truth" / "gt.txt").is_file()
 
 
+def test_a_video_of_odd_width_is_refused_before_anything_is_written(dddas, tmp_path):
+    out = tmp_path / "odd"
+    result = dddas("simulate", "demo", "--set", "camera.width_px=333", "--save", "video", "--out", out)
+    assert result.exit_code == 2 and not out.exists()
+    assert "needs an even width and height, got 333x" in result.output and "camera.width_px=334" in result.output
+
+
 def test_without_a_name_it_lists_the_scenarios(dddas):
     assert [line.split()[0] for line in dddas("simulate").stdout.splitlines()] == scenario_names()
 

@@ -3,6 +3,7 @@
 import json
 import socket
 import ssl
+import struct
 import threading
 import time
 from contextlib import suppress
@@ -185,6 +186,33 @@ def test_a_server_that_does_not_read_costs_a_bounded_memory_and_gets_whole_lines
     wait_until(lambda: bytes(server.received[0]).count(b"\n") == number - stream.lost)
     whole, end, _ = bytes(server.received[0]).rpartition(b"\n")
     assert len(frames_in(whole + end)) == number - stream.lost
+
+
+def test_what_had_not_arrived_when_a_connection_broke_is_counted_as_lost(notes):
+    pytest.importorskip("termios")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
+        stream = opened(f"json:tcp://127.0.0.1:{listener.getsockname()[1]}", notes)
+        busy, written = tracked(1, 100), 0
+        while len(stream._outlet._ends) < 5:  # the server accepts, but never reads
+            written += 1
+            stream.write(None, busy)
+            time.sleep(0.005)
+        first, _ = listener.accept()
+        arrived = first.recv(1 << 24, socket.MSG_PEEK).count(b"\n")
+        assert stream.lost == 0
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)  # the next connection has room for all
+        first.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        first.close()
+        written += write_until(stream, lambda: any("works again" in note for note in notes[0])) - 1
+        stream.close()
+        second, _ = listener.accept()
+        with second:
+            content = bytearray()
+            while piece := second.recv(1 << 16):
+                content += piece
+    assert stream.lost >= 5 and arrived + content.count(b"\n") + stream.lost == written
+    assert notes[0][-1].endswith(f"works again; {stream.lost} messages lost") and len(notes[0]) == 2
 
 
 def test_what_a_server_sends_is_read_so_that_neither_side_stands_still(serve, notes):

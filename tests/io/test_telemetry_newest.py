@@ -171,13 +171,14 @@ def test_datagrams_that_came_in_another_order_are_read_by_their_times(window):
 
 
 def test_times_of_different_clocks_are_not_mixed(window):
-    fill(window, [*objects(), line(NOW_S + 1e6, 48.0), line(NOW_S, 48.1)])
-    with pytest.raises(InputError, match="runs back"):
-        window.read()
+    said = fill(window, [*objects(), line(NOW_S + 1e6, 48.0), line(NOW_S, 48.1)])
+    assert [words for words in said if words] == [said[-2]] and "ahead of the others" in said[-2]
+    log = window.read()
+    assert log is not None and np.isfinite(log.altitude_m).sum() == 21 and log.time_s[-1] == pytest.approx(NOW_S)
 
 
 def test_a_report_that_cannot_be_written_is_forgotten_as_other_damage(window):
-    fill(window, [b'{"time_s": 1, "odd": "\\ud800"}', *objects()])
+    fill(window, [b'{"time_s": 1699999997, "odd": "\\ud800"}', *objects()])
     with pytest.raises(UnicodeEncodeError):
         window.read()
     log = window.read()
@@ -203,3 +204,30 @@ def test_the_time_of_day_of_sentences_without_a_date_counts(window, behind_s):
     log = window.read()
     assert log is not None
     assert log.time_s[-1] == pytest.approx(NOW_S - 0.1 - behind_s, abs=0.01)
+
+
+@pytest.mark.parametrize("odd", [NOW_S + 1e6, 4e9, 1e18, 1e300, NOW_S - 1e6])
+@pytest.mark.parametrize("kind", ["json", "csv"])
+def test_a_row_with_an_odd_time_is_left_out_and_the_others_stay_readable(window, kind, odd):
+    told = [odd if k == 20 else NOW_S - 4 + k / 10 for k in range(40)]
+    lines = [line(told_s, 48 + k * 1e-5) for k, told_s in enumerate(told)]
+    if kind == "csv":
+        lines = [HEADER, *(f"{told_s},11.5,48,50".encode() for told_s in told)]
+    said = [words for words in fill(window, lines) if words]
+    assert len(said) == 1 and said[0].endswith("such rows are left out")
+    log = window.read()
+    assert log is not None and len(log) == 39 and log.time_s[-1] == pytest.approx(NOW_S - 0.1)
+
+
+def test_rows_after_a_clock_was_set_are_taken_again(window):
+    told = [NOW_S - 2 + k / 10 + (500 if k >= 10 else 0) for k in range(20)]
+    said = fill(window, [line(told_s, 48 + k * 1e-5) for k, told_s in enumerate(told)])
+    assert [bool(words) for words in said] == [k in (10, 11) for k in range(20)]
+    log = window.read()
+    assert log is not None and len(log) == 8
+
+
+def test_rows_that_an_outage_held_back_are_all_taken(window):
+    said = fill(window, [line(NOW_S - 90 + k, 48.0) for k in range(10)], 1.0)
+    said += [window.add(NOW_S, line(NOW_S - 80 + k, 48.0)) for k in range(80)]
+    assert not any(said)

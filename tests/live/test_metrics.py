@@ -4,28 +4,10 @@ import sys
 
 import pytest
 
-from torchvision_dddas.live.health import BOUNDS_S, Health
+from torchvision_dddas.live.health import BOUNDS_S
 from torchvision_dddas.live.metrics import metrics, metrics_page
 
 WORDS = {"reconnects": "Times that the stream was opened again.", "latency": "From capture to result."}
-
-
-@pytest.fixture
-def health():
-    filled = Health()
-    for name in ("captured", "dropped", "reconnects"):
-        filled.count(name, 3)
-    filled.gauge("every", 2)
-    filled.gauge("rate_hz", float("nan"))
-    for k in range(1, 101):
-        filled.took("latency", k / 1000)
-    filled.event("stream", "lost")
-    filled.event("load", "fewer keypoints")
-    filled.result()
-    filled.platforms = lambda: {
-        'ugv "1"\n\\': {"state": "sends pictures", "captured": 40, "dropped": 2, "frames": 38, "weight": None}
-    }
-    return filled
 
 
 def families(health, trouble="", lost=()):

@@ -64,7 +64,9 @@ def run(
     ],
     landmarks: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A CSV of landmarks and their places. [default: by telemetry alone]"),
+        typer.Option(
+            metavar="FILE", help="A CSV of landmarks; live also udp:, mavlink:, cot:. [default: no landmarks]"
+        ),
     ] = None,
     telemetries: Annotated[
         list[Path] | None,
@@ -91,7 +93,8 @@ def run(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="overlay,cot,map,report, all or none; with sim:NAME also truth; tables are always written.",
+            help="overlay,cot,map,report, all or none; with sim:NAME also truth; tables are always written. "
+            "With --live: overlay,clips. [default: all; with --live none]",
         ),
     ] = None,
     rate: Rate = None,
@@ -135,7 +138,7 @@ def run(
         list[str] | None,
         typer.Option(
             metavar="STREAM",
-            help="With --live: json:-, json:FILE, mot:FILE, cot:udp://HOST:PORT, cot:tls://..., ...; may be repeated.",
+            help="With --live: json:-, json:FILE, mot:FILE, cot:udp://HOST:PORT, video:udp://...; may be repeated.",
         ),
     ] = None,
     serve: Annotated[
@@ -209,10 +212,10 @@ def run(
     given_boxes = {"--detections": detections, "--detector": detector, "--movers": movers or None}
     limits = {"--allow-commands": allow_commands or None, "--geofence": geofence, "--altitude-band": altitude_band}
     if live:
-        others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
+        others: dict[str, object] = {"--scene": scene, "--background": background, "--seed": seed}
         why = "is of no use with --live: a live run cannot take a table of boxes; give a network with --detector"
         refuse_options({"--detections": detections}, why)
-        refuse_options(others, "is of no use with --live, which draws and simulates nothing")
+        refuse_options(others, "is of no use with --live, which draws no maps and simulates nothing")
         if command is None:
             refuse_options(limits, "is for --command mavlink:...; give it too")
         if serve is None:
@@ -258,7 +261,8 @@ def run(
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_settings(config, set_, ignore, quiet, geoid)
     if live:
-        from torchvision_dddas.live import CommandOptions, LiveOptions, run_live
+        from torchvision_dddas.io.output import parse_save
+        from torchvision_dddas.live import RECORDED, CommandOptions, LiveOptions, run_live
 
         options = LiveOptions(
             out=out,
@@ -281,6 +285,7 @@ def run(
             movers=movers,
             commanding=None if command is None else CommandOptions(command, allow_commands, geofence, altitude_band),
             serve_token=serve_token,
+            save=() if save is None else parse_save(save, RECORDED),
             lag=0 if latency is Latency.now else None,
         )
         code = run_live(options)

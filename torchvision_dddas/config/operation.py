@@ -71,6 +71,7 @@ class LiveParameters(Group):
     lost_s: float = parameter(40.0, "a camera lost for this time ends the run (exit code 70); 0: never", "s", 0, 86_400)
     watchdog_s: float = parameter(30.0, "a step that takes longer counts as hung; 0: no watchdog", "s", 0, 3600)
     status_s: float = parameter(2.0, "time between two writes of the status and the results", "s", 0.1, 600)
+    clip_s: float = parameter(5.0, "time before and after an event in a clip of --save clips", "s", 0, 60)
 
     @model_validator(mode="after")
     def _pauses_grow(self) -> "LiveParameters":

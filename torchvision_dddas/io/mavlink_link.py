@@ -381,6 +381,10 @@ class _UdpPort:
         try:
             self._socket.settimeout(_POLL_S)
             if listens:
+                group = socket.inet_aton(str(place[0])) if family == socket.AF_INET else b"\0"
+                if 224 <= group[0] < 240:  # multicast
+                    self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                    self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + bytes(4))
                 self._socket.bind(place)
         except OSError:
             self._socket.close()

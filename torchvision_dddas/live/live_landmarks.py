@@ -1,4 +1,4 @@
-"""Places of landmarks that come during a live run: JSON lines, CSV rows, or MAVLink messages of ground vehicles."""
+"""Places of landmarks that come during a live run: JSON lines, CSV rows, or reports of ground vehicles."""
 
 import csv
 import json
@@ -18,6 +18,7 @@ from torchvision_dddas.geo import AerialLocator, to_local
 from torchvision_dddas.io.mavlink_link import is_mavlink, take_systems
 from torchvision_dddas.io.telemetry import is_clock, kind_of_report, message_parts
 from torchvision_dddas.live.capture import LiveSource
+from torchvision_dddas.live.cot_input import CotInput
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.report_inputs import ReportInput, is_live_input, open_input
 from torchvision_dddas.types import Landmarks
@@ -29,11 +30,17 @@ _DEGREES, _METRES = ("longitude_deg", "latitude_deg"), ("east_m", "north_m")
 
 
 def open_landmarks(path: Path | Landmarks | None, source: LiveSource, health: Health) -> "LiveLandmarks | None":
-    """Open --landmarks if it names a live input; `mavlink:...?ugv1=11` names vehicles. Raise errors of open_input."""
+    """Open --landmarks if it names a live input. `mavlink:...?ugv1=11` and `cot:...?ugv1=UID` name vehicles.
+
+    Raise errors of open_input.
+    """
     if not isinstance(path, Path) or not is_live_input(str(path)):
         return None
     if not source.is_stream:
         raise InputError(f"--landmarks {path} is for a camera or a stream; for a recording give a table")
+    if str(path).startswith("cot:"):
+        events = CotInput(str(path), lambda words: health.event("landmarks", words))
+        return LiveLandmarks(str(path), events, dict(enumerate(events.names.values())), health)
     text, systems = take_systems(str(path), "--landmarks") if is_mavlink(str(path)) else (str(path), {})
     if is_mavlink(text) and not systems:
         raise InputError(f"--landmarks {path} names no vehicle; give their systems, such as {text}?ugv1=11&ugv2=12")
@@ -44,7 +51,7 @@ def open_landmarks(path: Path | Landmarks | None, source: LiveSource, health: He
 class LiveLandmarks:
     """A thread that reads where landmarks are. Each has the latest reports and its first one.
 
-    systems: names of MAVLink systems; without them the reports name their landmarks.
+    systems: names of MAVLink systems, or of the landmarks by any number; empty: each that reports is a landmark.
     """
 
     def __init__(self, name: str, source: ReportInput, systems: Mapping[int, str], health: Health) -> None:

@@ -182,11 +182,14 @@ class MavlinkComponent:
         )
 
     def _video_information(self) -> Any:
-        kind = _VIDEO_TYPES.get(self.video_uri.partition(":")[0])
-        if kind is None or len(self.video_uri) > 160:
+        scheme, _, rest = self.video_uri.partition(":")
+        kind = _VIDEO_TYPES.get(scheme)
+        # A ground station listens at the port of datagrams; the specification wants the port alone then.
+        uri = rest.rpartition(":")[2] if scheme == "udp" else self.video_uri
+        if kind is None or len(uri) > 160:
             return None
         return self.link.dialect.MAVLink_video_stream_information_message(
-            1, 1, kind, 1, self._rate_hz, *self._size_px, 0, 0, 0, b"annotated", self.video_uri.encode()
+            1, 1, kind, 1, self._rate_hz, *self._size_px, 0, 0, 0, b"annotated", uri.encode()
         )
 
     def _image_status(self) -> Any:

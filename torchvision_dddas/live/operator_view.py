@@ -171,14 +171,7 @@ class OperatorView:
         pictures = RunPictures((image.shape[1], image.shape[0]), self._about.landmarks, self._zones)
         for earlier in before:
             pictures.show(earlier)
-        assert result.frame is not None
-        tracked = replace(result.tracked, frame=replace(result.frame, image=image))
-        picture = pictures(replace(result, tracked=tracked))
-        if people is not None:
-            for identity, box in zip(people.tracks.identity.tolist(), people.tracks.box_px, strict=True):
-                rectangle(picture, box, PERSON, line_width(picture))
-                label(picture, box, f"person {identity}", PERSON)
-        return picture
+        return draw_result(pictures, result, people, image)
 
     def zones(self) -> list[dict[str, Any]]:
         """Return the zones on the ground in local metres."""
@@ -209,6 +202,20 @@ class OperatorView:
             "more": max(len(rows) - MOST_TARGETS, 0),
             "map": None if self._site is None else _map_facts(result, ways, self._site),
         }
+
+
+def draw_result(
+    pictures: RunPictures, result: FrameResult, people: TrackedFrame | None, image: np.ndarray
+) -> np.ndarray:
+    """Return the picture of a frame with its targets and people, (H, W, 3) uint8 BGR. image: the frame's picture."""
+    assert result.frame is not None
+    tracked = replace(result.tracked, frame=replace(result.frame, image=image))
+    picture = pictures(replace(result, tracked=tracked))
+    if people is not None:
+        for identity, box in zip(people.tracks.identity.tolist(), people.tracks.box_px, strict=True):
+            rectangle(picture, box, PERSON, line_width(picture))
+            label(picture, box, f"person {identity}", PERSON)
+    return picture
 
 
 def _target_rows(result: FrameResult) -> Iterator[dict[str, Any]]:

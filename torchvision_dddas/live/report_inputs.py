@@ -50,7 +50,7 @@ def is_live_input(text: str) -> bool:
     """Return whether telemetry comes live by its name: an address, `-`, `klv`, a FIFO or a device, but no file."""
     if names_file(text):
         return not (Path(text).is_file() or Path(text).is_dir())
-    return text in ("-", KLV) or is_mavlink(text) or re.match(r"(udp|nmea|gpsd):", text) is not None
+    return text in ("-", KLV) or is_mavlink(text) or re.match(r"(udp|nmea|gpsd|cot):", text) is not None
 
 
 def open_input(text: str, notify: Notify, metadata: deque[Report] | None = None) -> ReportInput:
@@ -60,7 +60,7 @@ def open_input(text: str, notify: Notify, metadata: deque[Report] | None = None)
     opened.
     """
     if names_file(text) or text == "-":
-        return _Lines(text, lambda: _FilePort(text), notify)
+        return Lines(text, lambda: _FilePort(text), notify)
     if text == KLV:
         if metadata is None:
             raise InputError(f"--telemetry {KLV}: the stream announces no KLV beside its pictures")
@@ -73,10 +73,10 @@ def open_input(text: str, notify: Notify, metadata: deque[Report] | None = None)
     if kind != "serial" and not re.fullmatch(r".+:\d{1,5}", place):
         raise InputError(f"--telemetry {text} lacks HOST:PORT; {WANTED}")
     opener = port_opener("tcp" if kind == "gpsd" else kind, place, f"--telemetry {text}")
-    return _Lines(text, opener, notify, is_datagram=kind == "udp", greeting=_WATCH if kind == "gpsd" else b"")
+    return Lines(text, opener, notify, is_datagram=kind == "udp", greeting=_WATCH if kind == "gpsd" else b"")
 
 
-class _Lines:
+class Lines:
     """Lines or datagrams from a port, which is opened again when it is lost."""
 
     system = 0
@@ -104,6 +104,7 @@ class _Lines:
             self._port.write(self._greeting)
 
     def receive(self) -> list[Report]:
+        """Return the reports that came; wait for a short time for the first, or until the port is tried again."""
         try:
             if self._port is None:
                 time.sleep(_POLL_S)
@@ -134,6 +135,7 @@ class _Lines:
             self._rest = b""
 
     def close(self) -> None:
+        """Close the port."""
         if self._port is not None:
             self._port.close()
             self._port = None

@@ -18,6 +18,7 @@ from torchvision_dddas.io.report import render_page
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.access import Access, cookie_name
 from torchvision_dddas.live.health import Health, Snapshot, snapshot_facts
+from torchvision_dddas.live.line_socket import LineSocket
 from torchvision_dddas.live.metrics import metrics_page
 from torchvision_dddas.live.operator_view import MOST_WATCHERS, PICTURES, OperatorView
 from torchvision_dddas.live.watchdog import Watchdog
@@ -45,7 +46,9 @@ _SENT_BYTES = 65_536  # buffer of a stream: a slow client gets few old pictures
 class HealthServer:
     """Serves pages while the context is open. address: (host, port) in use. pages: by path; may be filled later."""
 
-    def __init__(self, address: tuple[str, int], pages: dict[str, Page], access: Access | None = None) -> None:
+    def __init__(
+        self, address: tuple[str, int], pages: Mapping[str, Page | LineSocket], access: Access | None = None
+    ) -> None:
         """access: who may read the pages; None: no token is needed.
 
         Raise InputError if the port is in use, or if the host is not an address of this machine.
@@ -160,7 +163,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], pages: dict[str, Page], access: Access) -> None:
+    def __init__(self, address: tuple[str, int], pages: Mapping[str, Page | LineSocket], access: Access) -> None:
         self.pages, self.access, self.is_closing = pages, access, False
         self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
@@ -204,7 +207,11 @@ class _Handler(BaseHTTPRequestHandler):
             # The cookie takes the token out of the address, which histories and logs keep.
             cookie = f"{cookie_name(port)}={access.token}; HttpOnly; SameSite=Lax; Max-Age=31536000"
             self._send(303, "text/plain", "", {"Location": "./", "Set-Cookie": cookie})
-        elif page := self.server.pages.get(path):
+        elif isinstance(page := self.server.pages.get(path), LineSocket):
+            self.server.release(self.request)  # it lasts, so it is the oldest client soon
+            if why := page.serve(self, lambda: self.server.is_closing):
+                self._send(503, "text/plain", why)
+        elif page is not None:
             self._send(*page())
         else:
             self._send(404, "text/plain", f"there are {', '.join(self.server.pages)}\n")

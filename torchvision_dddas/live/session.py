@@ -28,12 +28,15 @@ from torchvision_dddas.io.output import (
 )
 from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
+from torchvision_dddas.io.video_packets import check_encoder
 from torchvision_dddas.live.access import choose_access
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.commanding import CommandOptions, LiveCommands, open_commands
 from torchvision_dddas.live.health import Health, StatusWriter
+from torchvision_dddas.live.line_socket import LineSocket
 from torchvision_dddas.live.operator_view import OperatorView
 from torchvision_dddas.live.receiver import DeadCamera
+from torchvision_dddas.live.recording import EventClips, OverlayFiles, PacketOutput, Recorder, SentPictures
 from torchvision_dddas.live.result_writer import ResultWriter
 from torchvision_dddas.live.run_inputs import RunInputs
 from torchvision_dddas.live.run_path import build_path
@@ -45,7 +48,7 @@ from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdo
 from torchvision_dddas.pipeline import AerialInput, locator_facts, map_site, note_unused
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import Tracker
-from torchvision_dddas.types import FrameResult
+from torchvision_dddas.types import Frame, FrameResult
 
 _WAITING = "waiting for the camera"
 # Parameters of the motion detector that landmarks and a commanded vehicle use too.
@@ -62,7 +65,8 @@ class LiveOptions:
 
     telemetry: the log beside `given`. emit: streams. serve: address of the page. wait: wait for an absent camera at the
     start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of its commands.
-    serve_token: as `choose_access` takes it. lag: as for `Tracker`; provisional results go to the streams alone.
+    serve_token: as `choose_access` takes it. save: some of RECORDED. lag: as for `Tracker`; provisional results go to
+    the streams alone.
     """
 
     out: Path
@@ -85,6 +89,7 @@ class LiveOptions:
     movers: bool = False
     commanding: CommandOptions | None = None
     serve_token: str | None = None
+    save: Sequence[str] = ()
     lag: int | None = None
 
 
@@ -136,7 +141,7 @@ class _Session:
         """Serve a page that says that the run waits for its camera."""
         options, address = self.options, None if self.options.serve is None else parse_address(self.options.serve)
         access = None if address is None else choose_access(address[0], options.serve_token)
-        self.pages = dict[str, Page]()
+        self.pages = dict[str, Page | LineSocket]()
         self.server: HealthServer | None = None
         if address is not None:
             self.server = self.stack.enter_context(HealthServer(address, self.pages, access))
@@ -216,12 +221,16 @@ class _Session:
     def open_outputs(self) -> None:
         """Open the streams and the session's folder with its record."""
         options, health, ready = self.options, self.health, self.ready
+        if options.save:
+            check_encoder(f"--save {options.save[0]}")
         # Data that streams need; the time follows the source's clock.
         self.about = About(time.time())
         if ready.watch is not None:
             site, camera = ready.watch.locator.site, ready.watch.locator.camera
-            height_m = site.plane_above_sea_m + site.geoid_m
-            self.about = About(time.time(), site.origin_deg is not None, site.landmarks.names, camera, height_m)
+            sea_m = site.plane_above_sea_m
+            heights_m = sea_m + site.geoid_m, sea_m
+            self.about = About(time.time(), site.origin_deg is not None, site.landmarks.names, camera, *heights_m)
+        self.pages["/stream"] = self.lines = LineSocket(self.about)
         self.opened = self.stack.enter_context(ExitStack())
         streams = _open(self.opened, options.emit, self.about, health, self.live, "--emit")
         self.folder = make_session_folder(options.out)
@@ -251,8 +260,25 @@ class _Session:
         facts |= {"command": asdict(options.commanding)} if options.commanding is not None else {}
         if options.detector is not None:
             facts |= {"detector": options.detector.facts, "movers": options.movers}
+        facts |= {"save": list(options.save)} if options.save else {}
         facts["settings"] = ready.settings.model_dump()
         return facts
+
+    def _open_recorder(self) -> Recorder | None:
+        """Return the recorder of the annotated pictures; None if no output takes them."""
+        options, notify = self.options, self.health.event
+        sent = [stream for stream in self.streams if stream.video is not None]
+        outputs: list[PacketOutput] = [SentPictures(stream) for stream in sent]
+        for place in [stream.name.partition(":")[2].partition("?")[0] for stream in sent]:
+            if self.commands is not None and place.startswith("udp:"):  # other streams go to a server of their own
+                self.commands.component.video_uri = place
+        outputs += [OverlayFiles(self.folder)] if "overlay" in options.save else []
+        outputs += [EventClips(self.folder, self.live.clip_s, notify)] if "clips" in options.save else []
+        zones = options.zones.zones if options.zones else ()
+        waits = self.inputs.is_recording and not self.live.pace  # pictures wait then, so that none is left out
+        if not outputs:
+            return None
+        return Recorder(outputs, self.source.rate_hz, options.interval, self.about, zones, notify, waits)
 
     def begin(self) -> None:
         """Connect the source with the path and the page, and start the threads that supervise the run."""
@@ -268,6 +294,11 @@ class _Session:
             ground_site = None if ready.watch is None else map_site(ready.watch.locator, None)
             self.view.begin(options.interval, self.about, ground_site, options.zones.zones if options.zones else ())
             feed.seen = self.view.take
+        self.recorder = recorder = self._open_recorder()
+        if recorder is not None:
+            stack.callback(recorder.close)
+            takers: list[Callable[[Frame], object]] = [feed.seen, recorder.take]
+            feed.seen = lambda frame: [take(frame) for take in takers]
 
         def stop(number: int) -> None:
             """Take no further picture; the run ends when all taken pictures are finished."""
@@ -304,15 +335,19 @@ class _Session:
         flight = self.ready.telemetry
         recorded_utc_s = flight.start_utc_s if self.inputs.is_recording and flight is not None else nan
         try:
-            with ResultWriter(self.streams, self.about, self.health, self.live.deadline_ms) as writer:
+            written = [stream for stream in self.streams if stream.video is None]
+            with ResultWriter(written, self.about, self.health, self.live.deadline_ms) as writer:
                 for located, people in results(self.path, self.feed, self.health):
                     is_settled = not located.tracks.provisional
                     located = self._add_events(located) if is_settled else located
                     start_utc_s = self.source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
                     newest = self.feed.newest
                     writer.put((located, people), start_utc_s, nan if newest is None else newest.taken_s)
+                    self.lines.write(located, people)
                     if self.server is not None and is_settled:
                         self.view.show(located, people)
+                    if self.recorder is not None and is_settled:
+                        self.recorder.show(located, people)
             self.status.state = "complete" if self.signals.signal is None else "stopped"
         except RepeatedFailure as error:
             self.failure, self.status.state = str(error), "failed"
@@ -343,6 +378,8 @@ class _Session:
             self.facts["notes"].append(self.tally.describe())
             self.health.event("locate", self.tally.describe())
         self.supervisor.say("STOPPING=1")
+        if self.recorder is not None:
+            self.recorder.close()
         self.opened.close()
 
     def tell_end(self) -> int:

@@ -5,6 +5,7 @@ import os
 import select
 import socket
 import ssl
+import struct
 import time
 from collections import deque
 from contextlib import suppress
@@ -13,6 +14,10 @@ from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams.outlets import LAST_S, KeptOutlet
+
+with suppress(ImportError):  # without it, what is under way when a connection breaks is not counted
+    import fcntl
+    import termios
 
 WANTED = "wanted tcp://HOST:PORT, or tls://HOST:PORT, which may have the options ca, cert, key and server"
 
@@ -27,8 +32,8 @@ _WAITS = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 class StreamOutlet(KeptOutlet):
     """Messages through one connection. Up to KEPT_BYTES of messages wait while it is not open.
 
-    Data from the other side is read and discarded. The messages that the system had accepted when a connection broke
-    may be lost without being counted.
+    Data from the other side is read and discarded. Messages that the other machine has not acknowledged when the
+    connection breaks are lost. Those that it acknowledged, but its program never read, cannot be counted.
     """
 
     def __init__(self, host: str, port: int, context: ssl.SSLContext | None = None, server: str = "") -> None:
@@ -45,19 +50,25 @@ class StreamOutlet(KeptOutlet):
         self._socket: socket.socket | None = None
         self._is_open = False
         self._begun_s = self._settled_s = 0.0
+        self._passed_bytes = 0  # through this connection
+        self._ends = deque[int]()  # of the messages that are not acknowledged yet, counted like _passed_bytes
 
     def flush(self) -> None:
         """Send while the other side accepts."""
         try:
             opened = self._opened()
             _discard_input(opened)
+            self._forget_acknowledged(opened)
             while self._kept:
                 try:
-                    self._begun += opened.send(self._kept[0][self._begun : self._begun + _PIECE_BYTES])
+                    taken = opened.send(self._kept[0][self._begun : self._begun + _PIECE_BYTES])
                 except _WAITS:
                     self._is_held = True  # TLS must be given the same bytes again
                     return
+                self._begun += taken
+                self._passed_bytes += taken
                 if self._begun >= len(self._kept[0]):
+                    self._ends.append(self._passed_bytes)
                     self._sent()
         except BlockingIOError:
             raise
@@ -79,10 +90,10 @@ class StreamOutlet(KeptOutlet):
         """Wait a little for a reader that is at work."""
         until_s = time.monotonic() + LAST_S
         with suppress(OSError):
-            while self._kept:
+            while self._kept or self._ends:
                 with suppress(BlockingIOError):
                     self.flush()
-                if not self._kept or time.monotonic() > until_s:
+                if not (self._kept or self._ends) or time.monotonic() > until_s:
                     break
                 time.sleep(0.01)
         self._lose_all()
@@ -148,12 +159,29 @@ class StreamOutlet(KeptOutlet):
             opened.do_handshake()
         self._settled_s = time.monotonic() + _SETTLE_S
 
+    def _forget_acknowledged(self, opened: socket.socket) -> None:
+        arrived = self._passed_bytes - _unacknowledged_bytes(opened)
+        while self._ends and self._ends[0] <= arrived:
+            self._ends.popleft()
+
     def _shut(self) -> None:
         if self._socket is not None:
+            self._forget_acknowledged(self._socket)
+            self._lose(len(self._ends), "it was not taken in time")
             with suppress(OSError):
                 self._socket.close()
         self._socket, self._is_open = None, False
+        self._passed_bytes = 0
+        self._ends.clear()
         self._begun, self._is_held = 0, False  # the next connection gets the first message whole
+
+
+def _unacknowledged_bytes(opened: socket.socket) -> int:
+    """Return how many bytes the system has accepted that the other machine has not acknowledged; 0 if unknown."""
+    try:
+        return int(struct.unpack("i", fcntl.ioctl(opened, termios.TIOCOUTQ, bytes(4)))[0])
+    except (NameError, OSError, ValueError):  # the last for a closed socket
+        return 0
 
 
 def _discard_input(opened: socket.socket) -> None:

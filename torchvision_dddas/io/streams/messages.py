@@ -41,7 +41,8 @@ class About:
 
     start_utc_s: seconds since 1970 at time_s = 0, NaN without a known clock. A live run sets it at its first
     picture, and again when the machine's clock is set. geographic: whether targets get longitudes and latitudes.
-    landmarks: their names. camera: the camera in the air. plane_above_ellipsoid_m: height of the local plane, up = 0.
+    landmarks: their names. camera: the camera in the air. plane_above_ellipsoid_m, plane_above_sea_m: height of the
+    local plane, up = 0.
     """
 
     start_utc_s: float = float("nan")
@@ -49,6 +50,7 @@ class About:
     landmarks: tuple[str, ...] = ()
     camera: Camera | None = None
     plane_above_ellipsoid_m: float = float("nan")
+    plane_above_sea_m: float = float("nan")
 
     @property
     def source(self) -> str:

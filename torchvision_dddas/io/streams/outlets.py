@@ -329,7 +329,7 @@ class DatagramOutlet(Outlet):
         return (*place[:3], number)  # a link-local address names its link
 
 
-def open_datagrams(text: str, asked: str) -> DatagramOutlet:
+def open_datagrams(text: str, asked: str, kind: type[DatagramOutlet] = DatagramOutlet) -> DatagramOutlet:
     """Open `udp://HOST:PORT?ttl=4`. asked: the whole option, for the message of an InputError. Raise OSError too."""
     try:
         parts = urlsplit(text)
@@ -344,4 +344,4 @@ def open_datagrams(text: str, asked: str) -> DatagramOutlet:
     is_beyond = not LEAST_BYTES <= most_bytes <= MOST_BYTES or not (ttl is None or 1 <= ttl <= 255)
     if not host or not port or is_odd or is_beyond:
         raise InputError(f"{asked} is no address; {WANTED}")
-    return DatagramOutlet(host, port, ttl, most_bytes, interface)
+    return kind(host, port, ttl, most_bytes, interface)

@@ -16,6 +16,7 @@ from torchvision_dddas.io.streams.connections import open_connection
 from torchvision_dddas.io.streams.messages import About, CotEvents, json_lines, mot_lines
 from torchvision_dddas.io.streams.mqtt import open_mqtt
 from torchvision_dddas.io.streams.outlets import LineOutlet, Outlet, open_datagrams
+from torchvision_dddas.io.streams.video import VideoMessages, open_video
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
 Notify = Callable[[str, str], object]
@@ -26,10 +27,10 @@ Encoder = Callable[[FrameResult | None, TrackedFrame | None, float, int], Sequen
 
 WANTED = (
     "wanted json, mot or cot, a colon, and - for standard output, a FILE, HOST:PORT after udp://, tcp:// or tls://, or "
-    "HOST:PORT/TOPIC after mqtt://, as in json:-"
+    "HOST:PORT/TOPIC after mqtt://; or video:udp://HOST:PORT; as in json:-"
 )
 
-_BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
+_BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<", "video": b""}
 _MOST_WAIT_S = 2.0  # longest wait for datagrams, which cost nothing to try
 _NOTIFY_S, _SELDOM_S = 30.0, 3600.0  # time between messages on the same loss, initially and finally
 _NUMBER = re.compile(r"\d+")
@@ -38,7 +39,8 @@ _NUMBER = re.compile(r"\d+")
 class Stream:
     """Send results, given in order. Trouble of the outlet never ends the run: it is reported once and retried later.
 
-    name: as the user wrote it, without passwords. One thread writes and closes.
+    name: as the user wrote it, without passwords. video: the encoder of a stream of pictures, which the recording
+    writes; None for other streams. One thread writes and closes.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class Stream:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """retry_s: wait before a broken outlet is tried again; it doubles at each try, up to retry_most_s."""
-        self.name = without_secrets(name)
+        self.name, self.video = without_secrets(name), encode if isinstance(encode, VideoMessages) else None
         self._encode, self._outlet, self._notify, self._clock = encode, outlet, notify, clock
         self._retry_s, self._retry_most_s = retry_s, retry_most_s
         self._lock = threading.Lock()
@@ -213,6 +215,8 @@ def open_stream(
         encode = partial(json_lines, about)
     elif kind == "mot":
         encode = mot_lines
+    elif kind == "video":
+        encode = VideoMessages(about)
     elif about.geographic:
         encode = CotEvents(about)
     else:
@@ -222,7 +226,9 @@ def open_stream(
         )
     try:
         outlet: Outlet
-        if is_datagram:
+        if kind == "video":
+            outlet = open_video(place, asked)
+        elif is_datagram:
             outlet = open_datagrams(place, asked)
         elif scheme.startswith("mqtt") and is_address:
             outlet = open_mqtt(place, asked)

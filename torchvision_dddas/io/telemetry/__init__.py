@@ -14,20 +14,25 @@ from torchvision_dddas.io.telemetry.autopilots import NAMES as MAVLINK_NAMES
 from torchvision_dddas.io.telemetry.clocks import parse_time_zone
 from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, message_parts, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
-from torchvision_dddas.io.telemetry.misb_packets import encode_flight
+from torchvision_dddas.io.telemetry.misb_packets import encode_flight, mapped
 from torchvision_dddas.io.telemetry.newest import ReportWindow, kind_of_report, split_reports
 from torchvision_dddas.io.telemetry.nmea import SENTENCE, read_nmea
 from torchvision_dddas.io.telemetry.record import KINDS, is_clock
 from torchvision_dddas.io.telemetry.tables import read_telemetry_table
 from torchvision_dddas.io.telemetry.text_logs import read_subtitles
+from torchvision_dddas.io.telemetry.vmti import VMTI, VmtiTarget, encode_vmti
 from torchvision_dddas.types import Telemetry
 
 __all__ = [
     "MAVLINK_NAMES",
+    "VMTI",
     "ReportWindow",
+    "VmtiTarget",
     "encode_flight",
+    "encode_vmti",
     "is_clock",
     "kind_of_report",
+    "mapped",
     "message_parts",
     "read_telemetry",
     "split_reports",

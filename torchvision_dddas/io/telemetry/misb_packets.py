@@ -1,6 +1,7 @@
 """Write MISB ST 0601 local sets: the inverse of the reader in `misb`."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,10 +11,10 @@ from torchvision_dddas.types import Flight
 _VERSION = 19  # of the standard
 
 
-def encode_flight(flight: Flight, utc_s: float) -> bytes:
+def encode_flight(flight: Flight, utc_s: float, further: Mapping[int, bytes] | None = None) -> bytes:
     """Return a local set with a report of a vehicle at utc_s, seconds since 1970. Unknown values are left out.
 
-    The vehicle flies level. Its nose has the camera's heading if its own heading is unknown.
+    further: values of other tags. The vehicle flies level. Its nose has the camera's heading if its own is unknown.
     """
     camera_deg, nose_deg = math.degrees(flight.heading_rad), math.degrees(flight.vehicle_heading_rad)
     nose_deg = camera_deg if math.isnan(nose_deg) else nose_deg
@@ -32,15 +33,16 @@ def encode_flight(flight: Flight, utc_s: float) -> bytes:
         20: mapped(math.degrees(flight.roll_rad) % 360, 0, 360, 4),
         56: mapped(flight.speed_m_s, 0, 255, 1),
         65: bytes([_VERSION]),
-        113: _imap(flight.altitude_m, -900, 40000, 4),
+        113: imap_bytes(flight.altitude_m, -900, 40000, 4),
+        **(further or {}),
     }
     return local_set({tag: value for tag, value in values.items() if value})
 
 
 def local_set(tags: dict[int, bytes]) -> bytes:
     """Return a packet: the universal key, its length, the tags (below 128) and the checksum."""
-    body = b"".join(bytes([tag]) + _length(len(value)) + value for tag, value in tags.items()) + b"\x01\x02"
-    packet = KEY + _length(len(body) + 2) + body
+    body = b"".join(bytes([tag]) + length_bytes(len(value)) + value for tag, value in tags.items()) + b"\x01\x02"
+    packet = KEY + length_bytes(len(body) + 2) + body
     total = np.frombuffer(packet + b"\0" * (len(packet) % 2), ">u2").sum(dtype=np.int64)
     return packet + (int(total) & 0xFFFF).to_bytes(2, "big")
 
@@ -54,7 +56,7 @@ def mapped(value: float, low: float, high: float, size: int, signed: bool = Fals
     return number.to_bytes(size, "big", signed=signed)
 
 
-def _imap(value: float, low: float, high: float, size: int) -> bytes:
+def imap_bytes(value: float, low: float, high: float, size: int) -> bytes:
     """Return a number as MISB ST 1201 (IMAPB) spreads it; no bytes if it is unknown or out of range."""
     if not low <= value <= high:
         return b""
@@ -63,5 +65,6 @@ def _imap(value: float, low: float, high: float, size: int) -> bytes:
     return math.floor(scale * (value - low) + offset).to_bytes(size, "big")
 
 
-def _length(count: int) -> bytes:
+def length_bytes(count: int) -> bytes:
+    """Return a length in BER, in one byte below 128."""
     return bytes([count]) if count < 128 else b"\x82" + count.to_bytes(2, "big")

@@ -28,6 +28,7 @@ from torchvision_dddas.types import Telemetry
 
 _WINDOW_S, _MOST, _LEAST = 8.0, 600, 12
 _SWAPPED_S = 5.0  # reports that come in another order than they were made differ by this time at most
+_AHEAD_S, _SET_AFTER = 60.0, 3  # how far a time may jump ahead; so many odd times in a row are those of a set clock
 _NAMES_MOST = 500  # columns that are read of JSON
 # gpsd's TPV reports, whose names are ambiguous elsewhere; its estimates of errors have no stated probability.
 _GPSD = {"time": "time", "lat": "latitude_deg", "lon": "longitude_deg", "speed": "speed_m_s", "altMSL": "above_sea_m"}
@@ -73,6 +74,8 @@ class ReportWindow:
         self._zone, self._order = parse_time_zone(time_zone), order
         self._header = b""  # of a CSV
         self._reports: deque[tuple[float, bytes]] = deque(maxlen=_MOST)
+        self._newest = math.nan, math.nan  # the latest time that a row tells, and when that row came
+        self._odd = 0  # rows with odd times since the last usual one
         memory = "/dev/shm"  # the disk of a board does not last if it is written ten times a second
         self._folder = tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None)
 
@@ -91,6 +94,8 @@ class ReportWindow:
         if kind == "csv" and not self._header:
             self._header = row
         elif row and row != self._header:
+            if why := self._odd_time(came_s, row):
+                return why
             self._reports.append((came_s, row))
             while len(self._reports) > _LEAST and self._reports[0][0] < came_s - _WINDOW_S:
                 self._reports.popleft()
@@ -105,6 +110,28 @@ class ReportWindow:
             return None
         is_usual = number in (HEARTBEAT, SYSTEM_TIME) or not self.system
         return "" if is_usual else f"MAVLink system {system} is left out: system {self.system} is taken; see ?system=N"
+
+    def _odd_time(self, came_s: float, row: bytes) -> str:
+        """Return why a row of an own table is left out for its time, which would make the others unusable; else ""."""
+        try:
+            if self.kind == "csv":
+                time_s = float(row.split(b",")[self._header.split(b",").index(b"time_s")])
+            else:
+                time_s = float(json.loads(row)["time_s"]) if self.kind == "json" else math.nan
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError):  # the reader of the window reports it
+            return ""
+        newest_s, newest_came_s = self._newest
+        ahead_s = time_s - newest_s
+        if ahead_s > came_s - newest_came_s + _AHEAD_S or ahead_s < -_SWAPPED_S:
+            self._odd += 1
+            if self._odd < _SET_AFTER:
+                apart = f"{ahead_s:g} s ahead of" if ahead_s > 0 else f"{-ahead_s:g} s behind"
+                return f"the time_s of a row is {apart} the others: such rows are left out"
+            self._reports.clear()  # the sender's clock was set
+            newest_s = math.nan
+        if math.isfinite(time_s):
+            self._odd, self._newest = 0, (time_s if math.isnan(newest_s) else max(time_s, newest_s), came_s)
+        return ""
 
     @property
     def came_s(self) -> float:

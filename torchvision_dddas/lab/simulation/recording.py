@@ -14,6 +14,7 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.camera_files import DISTORTION
 from torchvision_dddas.io.colour_files import format_colours
@@ -67,6 +68,10 @@ def record_scenario(
     for a name and a number of frames, with a function to call for each frame. serve: the devices as which the world is
     served while it runs; without them nobody steers it. Raises InputError for bad input.
     """
+    width, height = scenario.camera.width_px, scenario.camera.height_px
+    if "video" in save and (width % 2 or height % 2):
+        even = f"camera.width_px={width + width % 2} and camera.height_px={height + height % 2}"
+        raise InputError(f"--save video needs an even width and height, got {width}x{height}; set {even}")
     with _RecordingOutput(folder, save) as output, ExitStack() as stack:
         with name_scenario_in_errors(name):
             simulator = open_simulator(scenario)

@@ -4,17 +4,15 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from fractions import Fraction
-from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.video_packets import HZ, TransportStream, VideoEncoder, check_encoder
 
 _DATAGRAM = 7 * 188  # bytes: the usual seven packets
 _BURST = 24  # datagrams at once, because the buffers of receivers are small
-_HZ = 90_000
 _SEND_S = 0.5  # a TCP client that takes nothing for this time is disconnected
 
 
@@ -69,52 +67,24 @@ class CameraStream:
 
     def __init__(self, size_px: tuple[int, int], rate_hz: float, send: Callable[[bytes], object]) -> None:
         """send: called with datagrams of whole packets. Raise InputError without PyAV, and for odd sizes."""
-        try:
-            import av
-        except ImportError:
-            raise InputError("--serve needs PyAV: pip install 'torchvision-dddas[video]'") from None
+        check_encoder("--serve")
         if size_px[0] % 2 or size_px[1] % 2:
             raise InputError(f"--serve needs pictures of even width and height, got {size_px[0]}x{size_px[1]}")
-        self._av, self._send, self._written = av, send, bytearray()
-        prompt = {"flush_packets": "1", "max_interleave_delta": "1"}
-        opened: Any = av.open(self, "w", format="mpegts", buffer_size=100 * _DATAGRAM, container_options=prompt)
-        # A key frame a second, with its headers, lets receivers begin at any time.
-        options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18", "x264-params": "repeat-headers=1"}
-        options["g"] = str(max(1, round(rate_hz)))
-        self._video = opened.add_stream("libx264", rate=Fraction(rate_hz).limit_denominator(1000), options=options)
-        self._video.width, self._video.height = size_px
-        self._video.pix_fmt, self._video.codec_context.time_base = "yuv420p", Fraction(1, _HZ)
-        self._video.codec_context.thread_count = 1
-        self._data, self._container = opened.add_data_stream("klv"), opened
+        self._encoder, self._send = VideoEncoder(size_px, rate_hz, factor=18), send
+        self._stream = TransportStream(self._encoder)
         self._begin_s, self._last = time.monotonic(), -1
-
-    def write(self, content: bytes) -> int:
-        """Take bytes from the muxer."""
-        self._written += content
-        return len(content)
 
     def show(self, image: np.ndarray | None, metadata: bytes | None) -> None:
         """Send a picture (H, W, 3) BGR and its metadata, either of which may be missing."""
-        self._last = max(round(_HZ * (time.monotonic() - self._begin_s)), self._last + 1)
-        packets = []
-        if metadata is not None:
-            packets.append(self._av.Packet(metadata))
-            packets[0].stream, packets[0].time_base = self._data, Fraction(1, _HZ)
-            packets[0].pts = packets[0].dts = self._last
-        if image is not None:
-            frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
-            frame.pts, frame.time_base = self._last, Fraction(1, _HZ)
-            packets += self._video.encode(frame)
-        self._container.mux(packets)
-        self._hand_on()
+        self._last = max(round(HZ * (time.monotonic() - self._begin_s)), self._last + 1)
+        packets = [] if image is None else self._encoder.encode(np.ascontiguousarray(image), self._last / HZ)
+        self._hand_on(self._stream.mux(packets, metadata or b"", self._last))
 
     def close(self) -> None:
         """End the stream."""
-        self._container.close()
-        self._hand_on()
+        self._hand_on(self._stream.close())
 
-    def _hand_on(self) -> None:
-        content, self._written = bytes(self._written), bytearray()
+    def _hand_on(self, content: bytes) -> None:
         for number, place in enumerate(range(0, len(content), _DATAGRAM), 1):
             self._send(content[place : place + _DATAGRAM])
             if number % _BURST == 0:

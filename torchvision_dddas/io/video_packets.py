@@ -1,0 +1,151 @@
+"""Encode pictures as H.264 once, and put the packets into several files and streams. It needs PyAV (extra `video`)."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.atomic_files import PartFile, utf8_name
+
+HZ = 90_000
+"""Units of a packet's time stamp in a second."""
+
+_KEY_S = 1.0  # time between two key pictures, at which files and receivers can begin
+
+
+class VideoPacket(NamedTuple):
+    """An encoded picture, with its headers if it is a key picture. pts: its time in 1/HZ s."""
+
+    content: bytes
+    pts: int
+    is_key: bool
+
+
+def check_encoder(option: str) -> None:
+    """Raise InputError if PyAV is not installed. option: for the message."""
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        raise InputError(f"{option} needs PyAV: pip install 'torchvision-dddas[video]'") from None
+
+
+class VideoEncoder:
+    """Encodes pictures of one size at their own times. stream: the template of streams that take its packets."""
+
+    def __init__(self, size_px: tuple[int, int], rate_hz: float, factor: int = 22) -> None:
+        """size_px: (width, height), both even. rate_hz: usual pictures a second. factor: crf of x264."""
+        import av
+
+        self.size_px, self._av = size_px, av
+        self._container: Any = av.open(_Nowhere(), "w", format="h264")
+        options = {"preset": "ultrafast", "tune": "zerolatency", "crf": f"{factor}", "forced-idr": "1"}
+        options["x264-params"] = "repeat-headers=1"
+        rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
+        self.stream: Any = self._container.add_stream("libx264", rate=rate, options=options)
+        self.stream.width, self.stream.height = size_px
+        self.stream.pix_fmt, self.stream.codec_context.time_base = "yuv420p", Fraction(1, HZ)
+        self.stream.codec_context.thread_count = 2  # so memory does not depend on the number of cores
+        self._last, self._due = -1, 0
+
+    def encode(self, picture: np.ndarray, time_s: float) -> list[VideoPacket]:
+        """Return the packets of a picture (H, W, 3) BGR. A time that does not grow is moved behind the last one."""
+        planes = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).astype(np.uint8, copy=False)
+        frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        frame.pts = self._last = max(round(time_s * HZ), self._last + 1)
+        frame.time_base = Fraction(1, HZ)
+        if frame.pts >= self._due:
+            frame.pict_type, self._due = self._av.video.frame.PictureType.I, frame.pts + round(_KEY_S * HZ)
+        packets = self.stream.encode(frame)
+        return [VideoPacket(bytes(packet), packet.pts, packet.is_keyframe) for packet in packets]
+
+
+class _Nowhere:
+    """A file that keeps nothing: the container exists for its encoder only."""
+
+    def write(self, content: bytes) -> int:
+        return len(content)
+
+
+class VideoFile:
+    """An MP4 file of packets, which takes its place when it is closed. Its time begins with its first packet."""
+
+    def __init__(self, path: Path, encoder: VideoEncoder, is_short: bool = False) -> None:
+        """is_short: put the index before the pictures, for which the file is written twice. Raise OSError."""
+        import av
+
+        self.path = path
+        self._part = PartFile(path)
+        options = {"movflags": "faststart"} if is_short else {}
+        try:
+            self._container: Any = av.open(utf8_name(self._part.path), "w", format="mp4", options=options)
+            self._stream = self._container.add_stream_from_template(encoder.stream)
+        except BaseException:
+            self._part.discard()
+            raise
+        self.begin = self.end = -1
+
+    def write(self, packet: VideoPacket) -> None:
+        """Add a packet; the first is a key picture. Raise OSError if the disk refuses."""
+        self.begin = packet.pts if self.begin < 0 else self.begin
+        self.end = packet.pts
+        self._container.mux(_stamped(self._stream, packet, self.begin))
+
+    def close(self) -> None:
+        """Finish the file, and move it to its place. Raise OSError if the disk refuses."""
+        self._container.close()
+        self._part.keep()
+
+    def discard(self) -> None:
+        """Remove the unfinished file. Never raise."""
+        with suppress(Exception):  # a full disk refuses the last pictures again
+            self._container.close()
+        self._part.discard()
+
+
+class TransportStream:
+    """Puts packets and metadata in KLV into an MPEG transport stream. write: takes bytes from the muxer."""
+
+    def __init__(self, encoder: VideoEncoder) -> None:
+        import av
+
+        self._written = bytearray()
+        # A stated length lets receivers take a picture before the next one begins.
+        options = {"flush_packets": "1", "max_interleave_delta": "1", "omit_video_pes_length": "0"}
+        opened: Any = av.open(self, "w", format="mpegts", buffer_size=1 << 17, container_options=options)
+        self._video = opened.add_stream_from_template(encoder.stream)
+        self._data, self._container = opened.add_data_stream("klv"), opened
+
+    def write(self, content: bytes) -> int:
+        """Take bytes from the muxer."""
+        self._written += content
+        return len(content)
+
+    def mux(self, packets: Sequence[VideoPacket], metadata: bytes, pts: int) -> bytes:
+        """Return the stream's next bytes. metadata: a packet at pts, or no bytes."""
+        made = [_stamped(self._data, VideoPacket(metadata, pts, True))] if metadata else []
+        self._container.mux(made + [_stamped(self._video, packet) for packet in packets])
+        return self._taken()
+
+    def close(self) -> bytes:
+        """End the stream, and return its last bytes."""
+        self._container.close()
+        return self._taken()
+
+    def _taken(self) -> bytes:
+        content, self._written = bytes(self._written), bytearray()
+        return content
+
+
+def _stamped(stream: Any, packet: VideoPacket, begin: int = 0) -> Any:
+    """Return a packet of PyAV for a stream. begin: the stream's zero, in 1/HZ s."""
+    import av
+
+    made = av.Packet(packet.content)
+    made.stream, made.time_base, made.is_keyframe = stream, Fraction(1, HZ), packet.is_key
+    made.pts = made.dts = packet.pts - begin
+    return made
