@@ -150,7 +150,7 @@ CASES = [
     ("run walk --emit json:-", "--emit is for a run that keeps up with a camera; give --live too"),
     ("run walk --serve 1", "--serve is for a run"),
     ("run walk --people", "--people is for a run"),
-    ("run walk --live --save all", "--save is of no use with --live"),
+    ("run walk --live --save masks", "--save must name some of overlay, clips, all or none"),
     ("run walk --live --serve eighty", "--serve eighty is no address"),
     ("run walk --live --emit csv:-", "csv:-"),
     ("run walk --live --emit json:/nowhere/at/all", "/nowhere/at/all"),

@@ -105,7 +105,7 @@ def test_what_ground_vehicles_see_steers_them_once_the_air_has_lost_a_crowd(tmp_
         "run",
         "sim:leaving",
         "--seed",
-        3,
+        5,
         *words,
         "--set",
         "steering.follow=false",

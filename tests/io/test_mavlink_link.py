@@ -129,6 +129,22 @@ def test_garbage_costs_no_message_and_gives_one_event(udp, heard: Heard) -> None
     assert len([text for text in heard.events if "no whole MAVLink" in text]) == 1
 
 
+def test_frames_that_are_longer_than_their_message_are_not_decoded(udp, heard: Heard, monkeypatch) -> None:
+    link, send, _ = udp
+    decode_frame, decoded = link._decoder.decode, list[bytes]()
+
+    def note(frame: bytearray) -> object:
+        decoded.append(bytes(frame))
+        return decode_frame(frame)
+
+    monkeypatch.setattr(link._decoder, "decode", note)
+    send(b"\xfe" * 1000)
+    send(Peer().heartbeat(3))
+    send(bytes(300))
+    assert heard.next().custom_mode == 3
+    assert not [frame for frame in decoded if frame.startswith(b"\xfe\xfe")]
+
+
 def test_a_message_does_not_wait_for_what_seemed_to_begin_before_it(udp, heard: Heard) -> None:
     _, send, _ = udp
     send(b"\xfd\xff\x00" + Peer().heartbeat(7))

@@ -120,6 +120,16 @@ def test_times_of_klv_are_those_of_the_stream_and_not_of_its_stamps(window):
     log = window.read()
     assert abs(START_US / 1e6 - NOW_S) > 1e6
     np.testing.assert_allclose(log.time_s, NOW_S + 0.04 * np.arange(25), atol=1e-5)
+    assert window.delay_s == pytest.approx(NOW_S - START_US / 1e6)
+
+
+@pytest.mark.parametrize("unit_us", [1, 1000])
+def test_reports_of_klv_have_the_times_of_their_pictures_even_if_these_are_irregular(window, unit_us):
+    times = NOW_S + np.cumsum(np.tile([0.03, 0.05, 0.04], 10))
+    for k, time_s in enumerate(times):
+        window.add(time_s, packet(k, {2: ((START_US + k * 40_000) // unit_us).to_bytes(8, "big")}))
+    np.testing.assert_allclose(window.read().time_s, times, atol=1e-5)
+    assert window.delay_s == pytest.approx(NOW_S + 0.04 - START_US / 1e6, abs=0.011)
 
 
 def test_pauses_of_a_link_are_no_remarks(window):

@@ -13,7 +13,7 @@ from tests.io.test_vmti import packs
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry.projection import axes_of
 from torchvision_dddas.io.streams import open_stream
-from torchvision_dddas.io.streams.video import encode_result
+from torchvision_dddas.io.streams.video import VideoMessages, encode_result
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import LocalSet, imap, local_sets
 from torchvision_dddas.io.telemetry.misb import mapped as read_mapped
@@ -96,6 +96,15 @@ def test_a_receiver_of_datagrams_gets_pictures_the_pose_and_the_targets(tmp_path
         found = imap(place[4:8], -180, 180), imap(place[:4], -90, 90)
         assert found == pytest.approx(tuple(degrees[identity - 1]), abs=1e-6)
     assert 17 not in targets[3]  # it is not located
+
+
+def test_datagrams_are_no_longer_than_the_address_says():
+    picture = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+    for most_bytes, packets in ((600, 3), (65507, 7), (0, 7)):
+        encoder, video = VideoEncoder((160, 120), 25.0), VideoMessages(KNOWN)
+        video.packets, video.encoder = encoder.encode(picture, 0.0), encoder
+        datagrams = video(shown(1), most_bytes=most_bytes)
+        assert {len(one) for one in datagrams[:-1]} == {packets * 188}
 
 
 def test_a_server_gets_the_same_bytes_through_a_connection(tmp_path):

@@ -323,6 +323,12 @@ def test_pictures_from_elsewhere_end_commanding(flight: Flight) -> None:
     assert flight.ask() == flight.safety.ended
 
 
+def test_a_camera_whose_place_is_unknown_permits_nothing(flight: Flight) -> None:
+    unknown = Proposal("roi", at(1, 1), flight.now_s, camera_deg=(math.nan, math.nan))
+    assert flight.safety.permit(unknown, flight.now_s) == "the place of the camera is unknown"
+    assert not flight.safety.ended
+
+
 def test_only_four_commands_exist_and_none_arms_or_changes_the_mode() -> None:
     assert sorted(NUMBERS.values()) == [192, 195, 1000, 1001]
 

@@ -45,7 +45,7 @@ class Rig:
         self.wire, self.health, self.now_s, self.frame = Wire(), Health(), 500.0, 0
         self.answers, self.mode, self.place_m, self.up_m = answers, 4, np.zeros(2), UP_M
         self.pose = pose_at((0, 0), UP_M)
-        self.ground, self.has_ended = ground or {}, False
+        self.ground, self.has_ended, self.has_pictures = ground or {}, False, True
         site = SimpleNamespace(origin_deg=HOME, landmarks=SimpleNamespace(names=tuple(self.ground)))
         locator: Any = SimpleNamespace(
             site=site,
@@ -83,8 +83,9 @@ class Rig:
         here = located(self.frame, targets, pose=self.pose, rate_hz=RATE_HZ)
         count = len(here.positions)
         tracks = Tracks(self.frame, np.arange(1, count + 1), here.box_px, np.ones(count), np.arange(count))
-        result = FrameResult(TrackedFrame(self.frame, None, Detections(), tracks), here)
-        newest = Frame(self.frame, (self.frame - 1) / RATE_HZ, np.zeros((1, 1), np.uint8))
+        newest = Frame(self.frame, (self.frame - 1) / RATE_HZ, np.zeros((1, 1), np.uint8), taken_s=self.now_s)
+        shown = newest if self.has_pictures else None
+        result = FrameResult(TrackedFrame(self.frame, shown, Detections(), tracks), here)
         feed: Any = SimpleNamespace(size=CAMERA.size_px, locator=self.locator, newest=newest, ended=self.has_ended)
         return self.commands.update(result, feed)
 
@@ -127,6 +128,24 @@ def test_the_decision_becomes_a_region_of_interest_and_a_reposition() -> None:
     assert np.allclose(metres(last), metres(roi[-1]), atol=1.5)
     assert rig.health.snapshot().counts["commands"] == len(rig.obeyed)
     assert rig.logged()[0].startswith("look at 31.6")
+
+
+def test_nothing_is_sent_while_the_components_listen() -> None:
+    rig = Rig()
+    rig.fly(1.9)
+    assert not rig.wire.sent and not rig.obeyed
+    rig.fly(2.0)
+    assert rig.obeyed
+
+
+def test_results_of_missing_pictures_are_not_fresh() -> None:
+    rig = Rig()
+    rig.has_pictures = False
+    rig.fly(8.0)
+    assert not rig.obeyed
+    rig.has_pictures = True
+    rig.fly(2.0)
+    assert rig.obeyed
 
 
 def test_results_and_streams_get_the_command_in_degrees() -> None:
@@ -343,7 +362,7 @@ def test_a_vehicle_that_does_not_answer_is_given_up() -> None:
 
 def test_refused_commands_are_told_and_tried_again() -> None:
     rig = Rig(answers=False)
-    rig.fly(2.0)
+    rig.fly(3.0)
     us = rig.commands.component
     rig.wire.say(dialect.MAVLink_command_ack_message(192, 2, 0, 0, us.system, us.component))
     assert "the vehicle refuses reposition, MAV_RESULT 2" in rig.events()

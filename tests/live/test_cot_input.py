@@ -126,6 +126,9 @@ def test_events_of_a_server_are_split_and_a_damaged_one_is_an_event():
         b'<!DOCTYPE x [<!ENTITY a "aaaa">]><event uid="ALPHA" type="a-f"><point lat="1" lon="&a;"/></event>',
         told("uid-2", "north"),
         b"\xbf\x01\xbf\x0a\x00 binary",
+        b'<event uid="ALPHA" type="a-f" cut off',
+        b'<event uid="ALPHA" type="a-f"><point lat="0.0" lon="0" ce="9999999.0"/></event>',
+        b'<event uid="\xff" type="a-f"><point lat="1" lon="1"/></event>',
     ],
 )
 def test_a_damaged_event_is_handed_on_as_it_is_and_the_next_is_read(opened, damaged):
@@ -133,6 +136,26 @@ def test_a_damaged_event_is_handed_on_as_it_is_and_the_next_is_read(opened, dama
     send(damaged, told("uid-2", 48.0))
     odd, good = reports(source, 2)
     assert odd[:20] == damaged[:20] and json.loads(good)["landmark"] == "ugv2"
+
+
+def test_an_event_in_an_unknown_encoding_does_not_end_the_input(opened):
+    source, send = opened()
+    for encoding in (b"nope", b"utf-16", b"utf-7"):
+        send(told("uid-2", 48.0).replace(b'"1.0"', b'"1.0" encoding="' + encoding + b'"'), told("uid-2", 48.5))
+        assert json.loads(reports(source, 2)[1])["latitude_deg"] == 48.5
+
+
+@pytest.mark.parametrize("query", ["ugv1=a&ugv1=b", "ugv1=a&ugv2=a"])
+def test_each_landmark_has_a_uid_of_its_own(query):
+    with pytest.raises(InputError, match="once"):
+        CotInput(f"cot:udp:127.0.0.1:4242?{query}", print)
+
+
+def test_a_message_on_a_wrong_address_names_the_option_for_landmarks():
+    with pytest.raises(InputError, match=r"^--landmarks cot:udp:127.0.0.1:99999.*wanted cot:udp"):
+        CotInput("cot:udp:127.0.0.1:99999?a=b", print)
+    with pytest.raises(InputError, match=r"^--landmarks .* cannot be opened"):
+        CotInput("cot:udp:no.such.host.invalid:4242?a=b", print)
 
 
 @pytest.mark.parametrize(

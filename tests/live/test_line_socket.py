@@ -42,16 +42,38 @@ def until(is_true):
 
 def test_each_client_gets_the_lines_from_now_on(served):
     lines, host = served
-    lines.write(result(1, [(1, 2)]), None)
+    lines.write(result(1, [(1, 2)]), None, 1.6e9)
     with connect(host) as first, connect(host, origin=f"http://{host}") as second:
         until(lambda: len(lines._clients) == 2)
         for number in (2, 3):
-            lines.write(result(number, [(1, 2)]), None)
+            lines.write(result(number, [(1, 2)]), None, 1.6e9)
         for client in (first, second):
             read = [json.loads(client.recv(PATIENCE_S)) for _ in range(2)]
             assert [line["frame"] for line in read] == [2, 3] and read[0]["targets"][0]["id"] == 1
-        first.ping().wait(PATIENCE_S)  # programs ask whether the server is still there
+        assert first.ping().wait(PATIENCE_S), "programs ask whether the server is still there"
     until(lambda: not lines._clients)
+
+
+def test_the_end_of_a_run_sends_the_last_lines_and_closes_the_connection(served):
+    closed = pytest.importorskip("websockets.exceptions").ConnectionClosedOK
+    lines, host = served
+    with connect(host, max_queue=None) as client:
+        until(lambda: lines._clients)
+        for number in range(1, 51):
+            lines.write(result(number, [(1, 2)]), None, 1.6e9)
+        lines.close()
+        assert [json.loads(client.recv(PATIENCE_S))["frame"] for _ in range(50)] == list(range(1, 51))
+        with pytest.raises(closed, match="the run has ended"):
+            client.recv(PATIENCE_S)
+    until(lambda: not lines._clients)
+
+
+def test_a_line_has_the_time_of_its_own_result(served):
+    lines, host = served
+    with connect(host) as client:
+        until(lambda: lines._clients)
+        lines.write(result(1, [(1, 2)]), None, 0.0)
+        assert json.loads(client.recv(PATIENCE_S))["utc"].startswith("1970-01-01T00:00:0")
 
 
 def test_other_sites_and_plain_requests_are_refused(served):
@@ -87,7 +109,7 @@ def test_the_server_ends_while_a_client_reads_and_a_slow_client_misses_the_oldes
     with connect("{}:{}".format(*server.address)) as client:
         until(lambda: lines._clients)
         for number in range(1, 101):
-            lines.write(result(number, [(1, 2)]), None)
+            lines.write(result(number, [(1, 2)]), None, 1.6e9)
         go_on.set()
         assert json.loads(client.recv(PATIENCE_S))["frame"] == 96
         server.__exit__(None, None, None)

@@ -178,6 +178,65 @@ def test_a_sure_estimate_of_the_clock_offset_is_used_and_reported(live, monkeypa
     assert flight is not None and flight.altitude_m == pytest.approx(1.0, abs=1e-6)
 
 
+def test_results_have_the_times_of_exposure_by_the_stamps_of_klv_unless_its_clock_is_wrong(live):
+    made, script, health = live
+    made._window.delay_s = 0.3
+    script.reports.append((1.7e9, row(1.7e9)))
+    until(lambda: made.delay_s == 0.3)
+    feed, _ = feed_of(Camera(1.7e9, 2), Telemetry(np.arange(2.0), np.full(2, 50.0), np.zeros(2)), 0.2)
+    feed.live = made
+    assert feed.exposed_utc_s == pytest.approx(1.7e9 - 0.5)
+    feed.clock_offset_s = -3600.0  # the zone of a log, and no delay
+    assert feed.exposed_utc_s == pytest.approx(1.7e9 - 0.3)
+    made._window.delay_s = -61.0
+    script.reports.append((1.7e9, row(1.7e9)))
+    until(lambda: made.delay_s == 0.0)
+    said = [text for text in texts(health) if "stamps" in text]
+    assert said[0].startswith("results have the times of the stamps of ")
+    assert "are 61 s after the pictures come: results have the times of reception" in said[1]
+
+
+def test_metadata_waits_for_the_picture_with_its_stamp_and_has_its_time():
+    clock = FakeClock()
+
+    class Irregular(FakeStream):
+        """Pictures whose stamps are irregular. The packet of a picture comes with the picture before it."""
+
+        stamp_s = float("nan")
+
+        def __init__(self) -> None:
+            pause = partial(time.sleep, 0.001)
+            super().__init__(
+                (step for k in itertools.count() for step in (0.03 + 0.02 * (k % 2), pause, k % 200)), clock=clock
+            )
+            self.metadata: deque[tuple[float, bytes]] = deque()
+            self.count = 0
+
+        def at(self, count: int) -> float:
+            return 5000 + 0.04 * count + 0.007 * (count % 3)
+
+        def grab(self) -> bool:
+            came = super().grab()
+            self.stamp_s = self.at(self.count)
+            self.metadata.append((self.at(self.count + 1), b"%d" % (self.count + 1)))
+            self.count += 1
+            return came
+
+    source = LiveSource("fake", LiveParameters(lost_s=1.0), opener=Streams(Irregular()), clock=clock)
+    try:
+        packets, shown = dict[bytes, float](), set[float]()
+        for frame in source:
+            assert source.metadata is not None
+            packets |= {content: utc_s for utc_s, content in list(source.metadata)}
+            shown.add(round(source.start_utc_s + frame.time_s, 3))
+            if frame.number > 40:
+                break
+        known = sorted(round(utc_s, 3) for utc_s in packets.values())[5:-5]
+        assert len(known) > 10 and len(shown.intersection(known)) > 0.8 * len(known)
+    finally:
+        source.close()
+
+
 def test_packets_of_metadata_have_the_times_of_the_pictures_with_their_stamps():
     clock = FakeClock()
 

@@ -2,6 +2,8 @@
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +11,10 @@ import pytest
 from tests.zoned import result
 from torchvision_dddas.io import video_packets
 from torchvision_dddas.io.streams import About
+from torchvision_dddas.io.streams.video import VideoMessages
 from torchvision_dddas.io.video_packets import VideoFile
 from torchvision_dddas.live import recording
-from torchvision_dddas.live.recording import EventClips, OverlayFiles, Recorder
+from torchvision_dddas.live.recording import EventClips, OverlayFiles, Recorder, SentPictures
 from torchvision_dddas.types import Frame, ZoneEvent
 
 av = pytest.importorskip("av", reason="the extra video is not installed")
@@ -43,7 +46,7 @@ def film(recorder, count, events=None, size=(64, 48), first=1):
         recorder.take(frame)
         seen = result(number, [(1.0, 1.0)], RATE_HZ, located=False)
         tracked = replace(seen.tracked, frame=replace(frame, image=np.zeros((0, 0), np.uint8)))
-        recorder.show(replace(seen, tracked=tracked, events=(events or {}).get(number, ())), None)
+        recorder.show(replace(seen, tracked=tracked, events=(events or {}).get(number, ())), None, 1.6e9)
 
 
 def event(frame, kind="enter"):
@@ -158,6 +161,16 @@ def test_the_run_never_waits_and_what_is_left_out_is_counted(tmp_path, told, mon
     assert len(pictures(tmp_path / "overlay.mp4")[0]) == 32
 
 
+def test_results_of_missing_pictures_do_not_count_as_drawn_too_slowly(tmp_path, told):
+    recorder = Recorder([OverlayFiles(tmp_path)], RATE_HZ, 1, About(), (), lambda kind, text: told.append(text))
+    film(recorder, 3)
+    seen = result(4, [(1.0, 1.0)], RATE_HZ, located=False)
+    frame = Frame(4, 0.3, np.zeros((0, 0), np.uint8))  # of another size, or lost: the run does not see it
+    recorder.show(replace(seen, tracked=replace(seen.tracked, frame=frame)), None, 1.6e9)
+    recorder.close()
+    assert told == [] and len(pictures(tmp_path / "overlay.mp4")[0]) == 3
+
+
 def test_a_picture_that_cannot_be_drawn_ends_the_recording_and_not_the_run(tmp_path, told, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("no picture")
@@ -166,3 +179,20 @@ def test_a_picture_that_cannot_be_drawn_ends_the_recording_and_not_the_run(tmp_p
     record([OverlayFiles(tmp_path)], told, 5)
     assert told == ["overlay.mp4 ends: ZeroDivisionError: no picture; the run goes on without it"]
     assert names(tmp_path) == []
+
+
+def test_a_stream_of_pictures_has_the_start_time_of_each_result(told):
+    video, sent = VideoMessages(About(5.0)), []
+    stream: Any = SimpleNamespace(name="video", video=video, write=lambda _: sent.append(video.about.start_utc_s))
+    about = About()
+    recorder = Recorder(
+        [SentPictures(stream, about)], RATE_HZ, 1, about, (), lambda kind, text: told.append(text), True
+    )
+    for number in (1, 2):
+        image = np.zeros((48, 64, 3), np.uint8)
+        frame = Frame(number, (number - 1) / RATE_HZ, image)
+        recorder.take(frame)
+        seen = result(number, [(1.0, 1.0)], RATE_HZ, located=False)
+        recorder.show(replace(seen, tracked=replace(seen.tracked, frame=frame)), None, 1e9 + number)
+    recorder.close()
+    assert sent == [1e9 + 1, 1e9 + 2] and told == []

@@ -1,5 +1,6 @@
 """The loop of a live run goes on after errors, and sheds load."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,19 @@ def test_a_run_fails_after_many_errors_in_a_row_and_not_where_results_come_betwe
     assert len(list(results(path(broken=range(2, 200, 2)), feed_of(200), Health()))) == 101
 
 
+def test_provisional_results_do_not_hide_that_no_frame_is_settled():
+    def begin(feed):
+        for k, frame in enumerate(feed):
+            if k == 1:
+                raise ZeroDivisionError("the frame before")
+            located, people = result_of(frame)
+            tracks = replace(located.tracks, provisional=True)
+            yield replace(located, tracked=replace(located.tracked, tracks=tracks)), people
+
+    with pytest.raises(RepeatedFailure, match="25 times in a row"):
+        list(results(begin, feed_of(100), Health()))
+
+
 def test_a_source_that_breaks_is_iterated_again():
     assert numbers(results(path(), feed_of(6, breaks=3), Health())) == [1, 2, 3, 4, 5, 6]
 
@@ -151,6 +165,17 @@ def test_telemetry_that_falls_silent_and_comes_back_is_reported_once_each():
     # Seconds 0.5 to 0.7, and from one second after the end of the log on.
     assert [(event.kind, event.frame) for event in events] == [("telemetry", n) for n in (6, 9, 23)]
     assert ["silent" in event.text for event in events] == [True, False, True]
+
+
+def test_a_log_that_loses_the_angles_of_the_camera_is_in_trouble_until_they_come_back():
+    time_s, height_m = np.arange(30) / 10, np.full(30, 30.0)
+    heading_rad = np.where((time_s > 0.95) & (time_s < 1.55), np.nan, 1.0)
+    log = Telemetry(time_s, height_m, np.full(30, 5.0), heading_rad=heading_rad, pitch_rad=np.full(30, 1.0))
+    health = Health()
+    troubles = [health.snapshot().troubles for frame in feed_of(30, health, log) if frame.number in (9, 13, 20)]
+    assert troubles == [(), ("telemetry gives no angles of the camera",), ()]
+    texts = [event.text for event in health.snapshot().events]
+    assert texts == ["telemetry gives no angles of the camera", "telemetry gives angles of the camera again"]
 
 
 def test_telemetry_without_heights_above_ground_is_not_called_silent_while_it_speaks():

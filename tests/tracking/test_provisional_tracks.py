@@ -82,7 +82,7 @@ def test_the_sources_association_settles_each_frame_at_once_so_nothing_is_provis
     assert not any(tracks.provisional for tracks in found)
 
 
-@pytest.mark.parametrize("lag", [1, -1, 0.5, "now"])
+@pytest.mark.parametrize("lag", [1, -1, 0.5, "now", False])
 def test_another_lag_is_refused(lag) -> None:
     with pytest.raises(InputError, match="lag must be 0"):
         Tracker(lag=lag)

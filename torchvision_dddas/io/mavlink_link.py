@@ -221,6 +221,10 @@ class MavlinkLink:
 
     def _message(self, frame: bytearray) -> Any:
         """Decode a frame. Return None if it is damaged, and _REFUSED if its signature is missing or wrong."""
+        # Garbage of the first byte begins a frame at each byte. Its length is checked sooner than its checksum.
+        known = self.dialect.mavlink_map.get(frame[5]) if frame[0] == _V1 else None
+        if known is not None and frame[1] > known.unpacker.size:
+            return None
         signing = self._decoder.signing
         rejected, signing.timestamp = signing.reject_count, max(signing.timestamp, _signing_time())
         try:

@@ -80,14 +80,14 @@ class Proposal:
     """A command that the program would like to send.
 
     lonlat_deg: the place to fly to or to look at. decided_s: time of the picture. altitude_m: above home, to fly to.
-    camera_deg: the place of the camera; NaN if the vehicle's camera gave no picture.
+    camera_deg: the place of the camera, NaN if unknown; None if the vehicle's camera gave no picture.
     """
 
     kind: Kind
     lonlat_deg: tuple[float, float]
     decided_s: float
     altitude_m: float = math.nan
-    camera_deg: tuple[float, float] = (math.nan, math.nan)
+    camera_deg: tuple[float, float] | None = None
 
 
 class CommandSafety:
@@ -208,7 +208,10 @@ class CommandSafety:
             return reason
         if not -0.1 <= now_s - proposal.decided_s <= DECISION_S:
             return f"the decision is older than {DECISION_S:g} s"
-        apart_m = float(geometry.great_circle_m(np.array([self.place_deg]), np.array(proposal.camera_deg))[0])
+        camera_deg = self.place_deg if proposal.camera_deg is None else proposal.camera_deg
+        apart_m = float(geometry.great_circle_m(np.array([self.place_deg]), np.array(camera_deg))[0])
+        if math.isnan(apart_m):
+            return "the place of the camera is unknown"
         if apart_m > APART_M:
             self.end(f"the pictures are taken more than {APART_M:g} m away from system {self.system}")
             return self.ended

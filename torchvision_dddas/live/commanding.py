@@ -78,6 +78,7 @@ class _Decision:
     """A decision for a vehicle, places in degrees.
 
     up_m, camera_deg: height of the UAV above the ground plane, and place of its camera, at that time; NaN if unknown.
+    camera_deg is None for a ground vehicle.
     """
 
     taken_s: float
@@ -86,7 +87,7 @@ class _Decision:
     altitude_m: float | None = None
     up_m: float = math.nan
     speed_m_s: float = -1.0
-    camera_deg: tuple[float, float] = (math.nan, math.nan)
+    camera_deg: tuple[float, float] | None = None
 
     def propose(self, kind: Kind, place: tuple[float, float], altitude_m: float = math.nan) -> Proposal:
         """Return a command to a place as the safety rules judge it."""
@@ -207,7 +208,7 @@ class LiveCommands:
         look_at, fly_to = self._degrees(command.look_at), self._degrees(command.fly_to)
         command = replace(command, look_at=look_at, fly_to=fly_to, orders=orders)
         frame = result.frame
-        taken_s = frame.taken_s if frame is not None and math.isfinite(frame.taken_s) else self._clock()
+        taken_s = math.nan if frame is None else frame.taken_s
         pose, up_m, camera_m = located.fix.pose, math.nan, np.full(2, np.nan)
         if flight is not None:
             up_m, camera_m = flight.altitude_m, np.array(flight.place)
@@ -219,7 +220,8 @@ class LiveCommands:
         for order in orders:
             speed_m_s = order.speed_m_s
             decisions[order.vehicle] = _Decision(taken_s, order.look_at, order.goal, None, 0.0, speed_m_s)
-        self._decisions = decisions
+        if math.isfinite(taken_s):  # a decision for a missing picture has no age; the last one stays, and becomes old
+            self._decisions = decisions
         located = replace(located, adjustments=(*located.adjustments, *made))
         return replace(result, locations=located, command=command)
 
@@ -233,7 +235,7 @@ class LiveCommands:
                 vehicle.safety.check(now_s)
                 self._tell_end(vehicle)
                 decision = decisions.get(vehicle.name)
-                if vehicle.safety.ended or decision is None:
+                if vehicle.safety.ended or decision is None or not self.component.has_begun:
                     continue
                 if reason := vehicle.safety.waiting_for():  # of a ground vehicle
                     self._tell(vehicle, f"no command leaves: {reason}")

@@ -51,7 +51,7 @@ def open_landmarks(path: Path | Landmarks | None, source: LiveSource, health: He
 class LiveLandmarks:
     """A thread that reads where landmarks are. Each has the latest reports and its first one.
 
-    systems: names of MAVLink systems, or of the landmarks by any number; empty: each that reports is a landmark.
+    systems: names of landmarks by MAVLink system, or by any number for other inputs; empty: every sender is a landmark.
     """
 
     def __init__(self, name: str, source: ReportInput, systems: Mapping[int, str], health: Health) -> None:

@@ -27,7 +27,7 @@ Complete = Callable[[Telemetry], tuple[Telemetry, list[str]]]
 _REFRESH_S = 0.2
 _KEPT_S = 90.0  # of the flight, from which a clock offset is estimated
 _GAP_S = 2.0  # nothing is interpolated over a longer pause
-_WRONG_CLOCK_S = 5.0
+_WRONG_CLOCK_S, _SAME_DELAY_S = 5.0, 0.05
 _WAIT_S, _SETTLING_S = 10.0, 1.0  # for the first report, and for those of other kinds after it
 # A clock offset is estimated so often; a less certain or larger estimate is not used.
 _MEASURE_S, _SURE_S, _MOST_OFFSET_S = 10.0, 0.1, 10.0
@@ -63,7 +63,8 @@ class LiveTelemetry:
 
     raw: the newest reports as they were read; None before the first. log: the flight of the latest minute and a half,
     completed and continued beyond the newest report. measure: called now and then in the thread, to estimate the clock
-    offset. clock_offset_s: as in `align_log`.
+    offset. clock_offset_s: as in `align_log`. delay_s: from the exposure of pictures, by the stamps of their KLV, to
+    their reception; 0 if unknown.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class LiveTelemetry:
         self.name, self.is_awaited, self._aerial = window.name, is_awaited, aerial
         self.raw: Telemetry | None = None
         self.log: Telemetry | None = None
-        self.clock_offset_s = 0.0
+        self.clock_offset_s = self.delay_s = 0.0
         self.measure: Callable[[], object] = lambda: None
         self._source, self._window, self._health = source, window, health
         self._complete: Complete | None = None
@@ -162,6 +163,7 @@ class LiveTelemetry:
                 if is_new and now_s > refreshed_s + _REFRESH_S:
                     refreshed_s, is_new = now_s, False
                     self.raw = self._window.read() or self.raw
+                    self._measure_delay(self._window.delay_s)
                     self._refresh(complete)
                 if now_s > measured_s + _MEASURE_S:
                     measured_s = now_s
@@ -193,6 +195,19 @@ class LiveTelemetry:
             self.tell(note)
         self._flown = _merge(self._flown, log[log.time_s >= raw.time_s[0]])
         self.log = predict_flight(self._flown, self._aerial)
+
+    def _measure_delay(self, delay_s: float) -> None:
+        """Take a delay of the pictures, unless it is like the last one, or shows that the sender's clock is wrong."""
+        if abs(delay_s - self.delay_s) <= _SAME_DELAY_S or math.isnan(delay_s):
+            return
+        is_right = 0 <= delay_s < _WRONG_CLOCK_S
+        self.delay_s = delay_s if is_right else 0.0
+        self._health.gauge("picture_delay_s", self.delay_s)
+        if is_right:  # the first delay is often longer, because pictures wait while the stream is opened
+            self.tell(f"results have the times of the stamps of {self.name}; pictures come picture_delay_s later")
+        else:
+            when = f"{abs(delay_s):.0f} s {'before' if delay_s > 0 else 'after'} the pictures come"
+            self.tell(f"the stamps of {self.name} are {when}: results have the times of reception; set the clocks")
 
     def _check_clock(self, raw: Telemetry) -> None:
         behind_s = self._window.came_s - (float(raw.time_s[-1]) + self.clock_offset_s)

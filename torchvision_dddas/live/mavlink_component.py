@@ -31,8 +31,8 @@ class MavlinkComponent:
     """An onboard computer and a camera on a link. Call `show` with each result, and `tick` several times a second.
 
     system: the vehicle's number; 0 until a vehicle is heard. chosen: identity of the target that a ground station
-    chose; 0 without a choice. video_uri: address of the annotated stream; "" without a stream. is_geographic: whether
-    targets are located in degrees.
+    chose; 0 without a choice. has_begun: whether the components have listened, and have their numbers. video_uri:
+    address of the annotated stream; "" without a stream. is_geographic: whether targets are located in degrees.
     """
 
     def __init__(
@@ -42,12 +42,12 @@ class MavlinkComponent:
         self.component, self.camera = 191, 100
         self._given, self._size_px, self._rate_hz, self._notify = system, size_px, rate_hz, notify
         self._result: FrameResult | None = None
-        self._seen_s, self._now_s, self._heard_s = -math.inf, 0.0, math.inf
+        self._seen_s, self._now_s, self._heard_s = -math.inf, math.inf, math.inf  # no time is known before a tick
         self._start_s: float | None = None
         self._taken = set[tuple[int, int]]()  # systems and components of others
         self._intervals_s = dict.fromkeys((_IMAGE_STATUS, _GEO_STATUS), _DEFAULT_S)
         self._due_s = dict.fromkeys((0, _IMAGE_STATUS, _GEO_STATUS), -math.inf)  # 0: heartbeats
-        self._beats = False
+        self.has_begun = False
         self._answers: dict[int, Callable[[], Any]] = {
             _CAMERA: self._camera_information,
             _VIDEO: self._video_information,
@@ -66,12 +66,12 @@ class MavlinkComponent:
         """Send the messages that are due at a time of a steady clock."""
         self._now_s = now_s
         self._start_s = self._start_s or now_s
-        if not self._beats:
+        if not self.has_begun:
             # Listen first, because other computers and cameras on the vehicle may have the usual numbers.
             waited_s = now_s - min(self._heard_s, self._start_s + _LISTEN_S)
             if waited_s < _LISTEN_S:
                 return
-            self.system, self._beats = self.system or 1, True
+            self.system, self.has_begun = self.system or 1, True
             self.component = self._free(191, 194)
             self.camera = self._free(100, 105)
         if self._is_due(0, _HEARTBEAT_S):
@@ -112,12 +112,12 @@ class MavlinkComponent:
     def _hear(self, utc_s: float, message: Any) -> None:
         kind = message.get_type()
         if kind == "HEARTBEAT":
-            if not self._beats:
+            if not self.has_begun:
                 self._taken.add((message.get_srcSystem(), message.get_srcComponent()))
             system = message.get_srcSystem()
             if is_autopilot(message) and self._given in (0, system) and self._heard_s == math.inf:
                 self.system, self._heard_s = system, self._now_s
-        elif kind in ("COMMAND_LONG", "COMMAND_INT") and self._beats and message.target_system in (0, self.system):
+        elif kind in ("COMMAND_LONG", "COMMAND_INT") and self.has_begun and message.target_system in (0, self.system):
             of_camera = message.target_component in (0, self.camera)
             result = self._obey(message) if of_camera else None
             component = message.target_component or self.camera

@@ -24,7 +24,8 @@ _OFF = 0.2  # relative error of the announced rate that is reported
 _MOST_HUNG = 3  # threads that may hang in a driver, which cannot be ended
 _MEASURED = 12  # pictures from which an unannounced rate is measured
 _FALLBACK_HZ = 10.0  # rate if these pictures come all at once
-_STAMPS = 25  # pictures whose median gives the time of day of time stamps
+_STAMPS = 25  # pictures whose time stamps give the times of metadata
+_HELD_S = 2.0  # metadata waits for the picture with its time stamp, unless the picture is later than this
 
 
 _WAITING_S = 1.0  # interval between calls of `waiting`
@@ -42,8 +43,8 @@ class Receiver:
     """Read a stream in a thread of its own from the start, and fill the queue once frames are taken.
 
     rate_hz: the given rate, else the announced rate, else the measured rate. size: size of the first picture; it
-    changes with the stream. metadata: as in LiveSource; the time of a packet is the time at which a picture with its
-    time stamp came. waiting: as in LiveSource. Raise InputError if no first picture comes.
+    changes with the stream. metadata: as in LiveSource; the time of a packet is that of the picture with its time
+    stamp. waiting: as in LiveSource. Raise InputError if no first picture comes.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class Receiver:
         self._odd_s: float | None = None  # time since which pictures differ from `size`; None: they do not
         self._off = False  # whether a wrong announced rate was reported
         self.metadata: deque[tuple[float, bytes]] | None = None
-        self._behind_s: deque[float] = deque(maxlen=_STAMPS)  # time of day minus time stamp of the latest pictures
+        self._shown: deque[tuple[float, float]] = deque(maxlen=_STAMPS)  # time stamps and times of the latest pictures
         self.threads: list[threading.Thread] = []
         self._at_work: threading.Thread | None = None  # the current thread; None if all hang
         self._spawn()
@@ -183,7 +184,7 @@ class Receiver:
         try:
             with self._driver(turn, OPENING):
                 stream = self._opener()
-            self._behind_s.clear()  # the time stamps of another connection begin anew
+            self._shown.clear()  # the time stamps of another connection begin anew
             if not self._ready:
                 with self._driver(turn, OPENING):
                     image = first_picture(stream, self.name)
@@ -296,18 +297,27 @@ class Receiver:
         return True
 
     def _take_metadata(self, stream: LiveStream, taken_s: float) -> None:
-        """Give the packets of metadata that came with a picture their times of day, by the time stamps of pictures."""
+        """Give packets of metadata the times of the pictures with their time stamps, or between these pictures."""
         packets, stamp_s = getattr(stream, "metadata", None), getattr(stream, "stamp_s", np.nan)
         if packets is None or self.metadata is None:
             return
         shown_s = self._clock.utc() - self._clock.now() + taken_s
         if self._queue.begun:  # the time that the picture has for the run
             shown_s = self._log.start_utc_s + (self._log.number - 1) / self.rate_hz
-        self._behind_s.append(shown_s - stamp_s)
-        behind_s = float(np.nanmedian(self._behind_s)) if np.isfinite(self._behind_s).any() else np.nan
-        while packets:
-            stamp_s, content = packets.popleft()
-            self.metadata.append((shown_s if np.isnan(stamp_s + behind_s) else stamp_s + behind_s, content))
+        if self._shown and not stamp_s > self._shown[-1][0]:
+            self._shown.clear()
+        if np.isfinite(stamp_s):
+            self._shown.append((stamp_s, shown_s))
+        stamps, times = np.array(self._shown).reshape(-1, 2).T
+        while packets and not 0 < packets[0][0] - stamp_s < _HELD_S:
+            said_s, content = packets.popleft()
+            if not len(stamps) or np.isnan(said_s):
+                said_s = shown_s
+            elif stamps[0] <= said_s <= stamps[-1]:
+                said_s = float(np.interp(said_s, stamps, times))
+            else:
+                said_s += float(np.median(times - stamps))
+            self.metadata.append((said_s, content))
 
     def _found(self) -> None:
         """Record that pictures come."""

@@ -25,13 +25,13 @@ from torchvision_dddas.types import Frame, FrameResult, TrackedFrame, Zone, is_s
 RECORDED = ("overlay", "clips")
 """Values of --save in a live run."""
 
-_MOST_PICTURES = 32  # that wait for their results, or to be drawn
-_MOST_RESULTS = 1000  # that wait to be drawn, most of them without a picture
-_PART_S = 600.0  # after which the next file of the overlay begins
-_LONGEST_S = 60.0  # of a clip; further events begin the next one
-_SETTLED_S = 10.0  # an event is reported so late at most
-_MOST_BYTES = 32 << 20  # of encoded pictures before an event
-_CLOSE_S = 30.0  # for what still waits at the end
+_MOST_PICTURES = 32  # pictures that wait for their results, and pictures that wait to be drawn
+_MOST_RESULTS = 1000  # results that wait to be drawn, most of them without a picture
+_PART_S = 600.0  # length of a file of the overlay
+_LONGEST_S = 60.0  # longest clip; a later event begins the next clip
+_SETTLED_S = 10.0  # longest time from an event to its report
+_MOST_BYTES = 32 << 20  # most bytes of encoded pictures that are kept for the next event
+_CLOSE_S = 30.0  # longest time at the end for pictures that still wait
 
 Notify = Callable[[str, str], object]
 
@@ -71,11 +71,14 @@ class Recorder:
         notify: Notify,
         waits: bool = False,
     ) -> None:
-        """notify: called with a kind and a message. waits: the run waits, so that the recording lacks nothing."""
+        """about: a record of its own; the thread sets the start time of each result in it.
+
+        notify: called with a kind and a message. waits: the run waits, so that the recording lacks nothing.
+        """
         self._outputs, self._rate_hz, self._interval = list(outputs), rate_hz / interval, interval
         self._about, self._zones, self._notify, self._waits = about, zones, notify, waits
         self._images: dict[int, np.ndarray] = {}  # by frame number, until the result comes
-        self._queue = queue.Queue[tuple[FrameResult, TrackedFrame | None, np.ndarray | None] | None]()
+        self._queue = queue.Queue[tuple[FrameResult, TrackedFrame | None, np.ndarray | None, float] | None]()
         self._drawn = threading.Semaphore(_MOST_PICTURES)
         self._left_out = self._count = 0
         self._pictures: RunPictures | None = None
@@ -85,22 +88,26 @@ class Recorder:
 
     def take(self, frame: Frame) -> None:
         """Keep the picture of a frame until its result comes."""
-        is_wanted = self._outputs and is_sampled(frame.number, self._interval)
-        if is_wanted and (self._waits or len(self._images) < _MOST_PICTURES):
+        if not self._outputs or not is_sampled(frame.number, self._interval):
+            return
+        self._count += 1
+        if self._waits or len(self._images) < _MOST_PICTURES:
             self._images[frame.number] = frame.image
+        else:
+            self._left_out += 1
 
-    def show(self, result: FrameResult, people: TrackedFrame | None) -> None:
-        """Record a result."""
+    def show(self, result: FrameResult, people: TrackedFrame | None, start_utc_s: float) -> None:
+        """Record a result. start_utc_s: as in `About`, for this result."""
         image = self._images.get(result.number)
         self._images = {k: kept for k, kept in self._images.items() if k > result.number}
         if result.frame is None or not self._outputs:
             return
-        self._count += 1
-        if image is not None and not self._drawn.acquire(blocking=self._waits):
+        has_room = self._queue.qsize() < _MOST_RESULTS
+        if image is not None and not (has_room and self._drawn.acquire(blocking=self._waits)):
             image = None
-        self._left_out += image is None
-        if self._queue.qsize() < _MOST_RESULTS:
-            self._queue.put((result, people, image))
+            self._left_out += 1
+        if has_room:
+            self._queue.put((result, people, image, start_utc_s))
 
     def close(self) -> None:
         """Complete the outputs."""
@@ -119,7 +126,7 @@ class Recorder:
     def _run(self) -> None:
         give_way()
         while (item := self._queue.get()) is not None:
-            result, people, image = item
+            result, people, image, self._about.start_utc_s = item
             try:
                 packets = self._encode(result, people, image)
             except Exception as error:  # a defect of this package must not end a run
@@ -196,7 +203,7 @@ class EventClips(PacketOutput):
     """Writes clips/000123-enter.mp4: some seconds before and after each event at a zone or of a crowd.
 
     The newest encoded pictures wait in memory, at most 32 MB. A clip with several events takes the name of the first,
-    and lasts a minute at most. A clip that cannot be written ends with an event; the next one is tried.
+    and lasts a minute at most. A clip that cannot be written gives an event; the next clip is tried.
     """
 
     name = "clips"
@@ -269,8 +276,11 @@ class EventClips(PacketOutput):
 class SentPictures(PacketOutput):
     """Sends packets through a stream of `--emit video:`, which the session closes."""
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: Stream, about: About) -> None:
+        """about: that of the recorder."""
         self.name, self._stream = stream.name, stream
+        if stream.video is not None:
+            stream.video.about = about
 
     def write(self, result: FrameResult, packets: Sequence[VideoPacket], encoder: VideoEncoder) -> None:
         """Send the packets of a result."""

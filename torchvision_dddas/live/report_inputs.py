@@ -88,7 +88,9 @@ class Lines:
         notify: Notify,
         is_datagram: bool = False,
         greeting: bytes = b"",
+        option: str = "--telemetry",
     ) -> None:
+        """option: for the message of an InputError."""
         self._name, self._open_port, self._notify = name, open_port, notify
         self._is_datagram, self._greeting = is_datagram, greeting
         self._rest, self._retry_s, self._due_s = b"", _RETRY_S, 0.0
@@ -96,7 +98,7 @@ class Lines:
         try:
             self._open()
         except OSError as error:
-            raise InputError(f"--telemetry {name} cannot be opened: {error.strerror or error}; is it there?") from None
+            raise InputError(f"{option} {name} cannot be opened: {error.strerror or error}; is it there?") from None
 
     def _open(self) -> None:
         self._port, self._rest = self._open_port(), b""

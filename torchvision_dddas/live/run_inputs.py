@@ -87,15 +87,13 @@ class RunInputs:
 
     def connect(self, feed: Feed, notes: Sequence[str]) -> None:
         """Let the feed take over reports and landmarks as they come. notes: of the run."""
-        source, offset_s = self.source, self._settings.aerial.clock_offset_s
+        offset_s = self._settings.aerial.clock_offset_s
         feed.clock_offset_s = nan if self.is_recording else offset_s
         if self.reports is not None and not self.is_recording:
             feed.live, self.reports.clock_offset_s = self.reports, offset_s
             feed.began = partial(self._follow, feed, notes)
         if (marks := self.marks) is not None:
-            feed.place_landmarks = lambda: marks.place(
-                feed.locator, source.start_utc_s - feed.clock_offset_s, source.rate_hz
-            )
+            feed.place_landmarks = lambda: marks.place(feed.locator, feed.exposed_utc_s, self.source.rate_hz)
 
     def _follow(self, feed: Feed, notes: Sequence[str], pipeline: Pipeline) -> None:
         """Complete live reports for the site of the locator; estimate the clock offset, unless it is given or known."""

@@ -22,6 +22,8 @@ from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
 
+_MOST_DELAY_S = 10.0  # a larger clock offset says that the clock of a log is wrong
+
 _MOST_FAILURES = 25
 """Consecutive restarts without a result after which the run gives up."""
 
@@ -64,6 +66,9 @@ class Feed:
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
+        self._is_blind, self._has_angles = False, False
+        if telemetry is not None:
+            self._has_angles = bool(np.isfinite(telemetry.heading_rad + telemetry.pitch_rad).any())
         self._first = True
         self._held: Frame | None = None  # first frame of another size, kept for the restarted pipeline
 
@@ -71,6 +76,12 @@ class Feed:
     def last(self) -> int:
         """Number of the newest frame, as in Source."""
         return self._source.last
+
+    @property
+    def exposed_utc_s(self) -> float:
+        """Seconds since 1970 at time_s = 0: at the exposure of that picture, or at its reception without a delay."""
+        offset_s = self.clock_offset_s if 0 <= self.clock_offset_s < _MOST_DELAY_S else 0.0
+        return self._source.start_utc_s - offset_s - (0.0 if self.live is None else self.live.delay_s)
 
     def restart(self) -> None:
         """Prepare for a new iteration by a pipeline that has seen no frame."""
@@ -121,6 +132,12 @@ class Feed:
             self.aligned(self.log)
         flight = self.log.at(frame.time_s, tolerance_s=tolerance_s)
         silent = flight is None or (self._has_altitude and not isfinite(flight.altitude_m))
+        is_blind = flight is not None and self._has_angles and not isfinite(flight.heading_rad + flight.pitch_rad)
+        if is_blind != self._is_blind:
+            self._is_blind = is_blind
+            words = f"telemetry gives {'no angles' if is_blind else 'angles'} of the camera{' again' * (not is_blind)}"
+            self._health.event("telemetry", words, frame.number)
+            self._health.trouble("camera angles", words if is_blind else "")
         if silent != self._silent:
             self._silent = silent
             ended = ": its log has ended" if silent and frame.time_s > self.log.time_s[-1] else ""
@@ -169,14 +186,16 @@ class _Renumbering:
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
     """Yield the results of `begin(feed)`; after an error call it again, and continue with the next frames.
 
-    Each error is an event, but the 25th without a result in between raises RepeatedFailure, and so does a dead camera.
-    An InputError after the end of the feed ends the run. `begin(feed)` also ends when the size of the pictures changes.
+    Each error is an event, but the 25th without a settled result in between raises RepeatedFailure, and so does a dead
+    camera. An InputError after the end of the feed ends the run. `begin(feed)` also ends when the size of the pictures
+    changes.
     """
     renumbered, failures = _Renumbering(), 0
     while True:
         try:
             for result in begin(feed):
-                failures = 0
+                if not result[0].tracks.provisional:  # a provisional result comes before most of the work
+                    failures = 0
                 yield renumbered(result)
         except DeadCamera as error:
             raise RepeatedFailure(str(error)) from error

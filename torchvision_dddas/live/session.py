@@ -66,7 +66,7 @@ class LiveOptions:
     telemetry: the log beside `given`. emit: streams. serve: address of the page. wait: wait for an absent camera at the
     start. detector, movers: as for `Pipeline`. commanding: the link of a vehicle and the limits of its commands.
     serve_token: as `choose_access` takes it. save: some of RECORDED. lag: as for `Tracker`; provisional results go to
-    the streams alone.
+    the lines of JSON alone.
     """
 
     out: Path
@@ -120,7 +120,8 @@ class _Session:
 
     def __init__(self, options: LiveOptions, stack: ExitStack) -> None:
         self.options, self.stack = options, stack
-        settings, is_network_alone = options.settings, options.detector is not None and not options.movers
+        settings = options.settings
+        is_network_alone = options.detector is not None and not options.movers
         # The torch engine finishes frames in batches, which would delay live results.
         self.backend = "onboard" if options.backend == "auto" else options.backend
         self.unused = note_unused(settings, _SHARED) if is_network_alone and not options.aerial else []
@@ -148,10 +149,24 @@ class _Session:
         self.view = OperatorView(partial(self.health.event, "page"))
         self.stack.callback(self.view.close)
         self.health.trouble("waiting", _WAITING)
-        self.pages |= health_pages(self.health, self.watchdog, (), lambda: _WAITING, self.name, VERSION, inf, self.view)
+        self.pages |= self._health_pages(lambda: _WAITING)
         if options.wait:  # the service is up, but has no camera yet
             self.supervisor.say("READY=1", f"STATUS={_WAITING}")
             self._print_page()
+
+    def _health_pages(
+        self, state_now: Callable[[], str], streams: Sequence[Stream] = (), patience_s: float = inf
+    ) -> dict[str, Page]:
+        return health_pages(
+            health=self.health,
+            watchdog=self.watchdog,
+            streams=streams,
+            state_now=state_now,
+            name=self.name,
+            version=VERSION,
+            patience_s=patience_s,
+            view=self.view,
+        )
 
     def open_camera(self) -> int | None:
         """Open the source. Return an exit code if the run ends while it waits for the camera, else None."""
@@ -188,8 +203,15 @@ class _Session:
         """Open all other inputs and the command link, and build the path from frames to results."""
         options, health, source, stack = self.options, self.health, self.source, self.stack
         self.inputs = inputs = RunInputs(
-            *(source, options.clip, options.given, options.telemetry, self.settings, self.backend, health),
-            *(self.waiting, stack),
+            source=source,
+            clip=options.clip,
+            given=options.given,
+            telemetry=options.telemetry,
+            settings=self.settings,
+            backend=self.backend,
+            health=health,
+            waiting=self.waiting,
+            stack=stack,
         )
         self.ready = ready = inputs.assemble()
         ready.notes.extend([str(source.levels)] if source.levels else [])
@@ -214,8 +236,16 @@ class _Session:
             opening = open_commands(commanding, ready.settings, source.size, source.rate_hz, locator, health)
             self.commands = stack.enter_context(opening)
         self.path = build_path(
-            *(ready, source, options.people, options.interval, self.backend, health, inputs.assemble),
-            *(options.detector, options.movers, options.lag),
+            ready=ready,
+            source=source,
+            people=options.people,
+            interval=options.interval,
+            backend=self.backend,
+            health=health,
+            prepare=inputs.assemble,
+            detector=options.detector,
+            movers=options.movers,
+            lag=options.lag,
         )
 
     def open_outputs(self) -> None:
@@ -228,8 +258,14 @@ class _Session:
         if ready.watch is not None:
             site, camera = ready.watch.locator.site, ready.watch.locator.camera
             sea_m = site.plane_above_sea_m
-            heights_m = sea_m + site.geoid_m, sea_m
-            self.about = About(time.time(), site.origin_deg is not None, site.landmarks.names, camera, *heights_m)
+            self.about = About(
+                start_utc_s=time.time(),
+                geographic=site.origin_deg is not None,
+                landmarks=site.landmarks.names,
+                camera=camera,
+                plane_above_ellipsoid_m=sea_m + site.geoid_m,
+                plane_above_sea_m=sea_m,
+            )
         self.pages["/stream"] = self.lines = LineSocket(self.about)
         self.opened = self.stack.enter_context(ExitStack())
         streams = _open(self.opened, options.emit, self.about, health, self.live, "--emit")
@@ -268,7 +304,8 @@ class _Session:
         """Return the recorder of the annotated pictures; None if no output takes them."""
         options, notify = self.options, self.health.event
         sent = [stream for stream in self.streams if stream.video is not None]
-        outputs: list[PacketOutput] = [SentPictures(stream) for stream in sent]
+        about = replace(self.about)  # the thread of the recording sets the start time in it
+        outputs: list[PacketOutput] = [SentPictures(stream, about) for stream in sent]
         for place in [stream.name.partition(":")[2].partition("?")[0] for stream in sent]:
             if self.commands is not None and place.startswith("udp:"):  # other streams go to a server of their own
                 self.commands.component.video_uri = place
@@ -278,16 +315,22 @@ class _Session:
         waits = self.inputs.is_recording and not self.live.pace  # pictures wait then, so that none is left out
         if not outputs:
             return None
-        return Recorder(outputs, self.source.rate_hz, options.interval, self.about, zones, notify, waits)
+        return Recorder(
+            outputs=outputs,
+            rate_hz=self.source.rate_hz,
+            interval=options.interval,
+            about=about,
+            zones=zones,
+            notify=notify,
+            waits=waits,
+        )
 
     def begin(self) -> None:
         """Connect the source with the path and the page, and start the threads that supervise the run."""
         options, health, source, ready, stack = self.options, self.health, self.source, self.ready, self.stack
         self.watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
         patience_s = max(2 * self.live.stall_s, 30 / source.rate_hz)
-        self.pages |= health_pages(
-            *(health, self.watchdog, self.streams, lambda: self.status.state, self.name, VERSION, patience_s, self.view)
-        )
+        self.pages |= self._health_pages(lambda: self.status.state, self.streams, patience_s)
         self.feed = feed = Feed(source, health, self.watchdog, ready.telemetry)
         self.inputs.connect(feed, ready.notes)
         if self.server is not None:
@@ -340,14 +383,14 @@ class _Session:
                 for located, people in results(self.path, self.feed, self.health):
                     is_settled = not located.tracks.provisional
                     located = self._add_events(located) if is_settled else located
-                    start_utc_s = self.source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
+                    start_utc_s = self.feed.exposed_utc_s if isnan(recorded_utc_s) else recorded_utc_s
                     newest = self.feed.newest
                     writer.put((located, people), start_utc_s, nan if newest is None else newest.taken_s)
-                    self.lines.write(located, people)
+                    self.lines.write(located, people, start_utc_s)
                     if self.server is not None and is_settled:
                         self.view.show(located, people)
                     if self.recorder is not None and is_settled:
-                        self.recorder.show(located, people)
+                        self.recorder.show(located, people, start_utc_s)
             self.status.state = "complete" if self.signals.signal is None else "stopped"
         except RepeatedFailure as error:
             self.failure, self.status.state = str(error), "failed"
@@ -378,6 +421,7 @@ class _Session:
             self.facts["notes"].append(self.tally.describe())
             self.health.event("locate", self.tally.describe())
         self.supervisor.say("STOPPING=1")
+        self.lines.close()
         if self.recorder is not None:
             self.recorder.close()
         self.opened.close()

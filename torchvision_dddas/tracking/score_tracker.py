@@ -253,7 +253,13 @@ class ScoreTracker:
             self.begun = trial.begun
         at, number = chosen.at, chosen.number
         return Tracks(
-            *(now.frame, number + 1, now.box_px[at], now.score[at], now.row[at], chosen.links), provisional=True
+            frame=now.frame,
+            identity=number + 1,
+            box_px=now.box_px[at],
+            score=now.score[at],
+            row=now.row[at],
+            link=chosen.links,
+            provisional=True,
         )
 
     def _settle(self, everything: bool = False) -> list[Tracks]:
@@ -403,7 +409,13 @@ class ScoreTracker:
         unseen[tracks] = False
         self.tracks, at = _join(self.tracks[unseen], chosen.continued, begun), chosen.at
         self.smoother.add(
-            *(now.frame, chosen.number, now.box_px[at], now.score[at], now.row[at], now.step, chosen.links),
+            frame=now.frame,
+            tracks=chosen.number,
+            box_px=now.box_px[at],
+            score=now.score[at],
+            row=now.row[at],
+            now_from_before=now.step,
+            link=chosen.links,
             trusts_single=self._trusts_single,
             least=_DAMAGED_HITS if now.damaged else self._least,
         )

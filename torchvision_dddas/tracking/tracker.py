@@ -100,14 +100,14 @@ class Tracker:
         if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
             raise InputError(f"size must be (width, height) in pixels, got {size}")
         self.settings, self.interval, self.size = check_settings(settings), int(interval), size
-        if lag not in (None, 0):
+        if isinstance(lag, bool) or lag not in (None, 0):
             raise InputError(f"lag must be 0 (provisional tracks at once) or None (settled tracks only), got {lag!r}")
         self._motion, self._certain, self._rate_hz, self._lag = motion, certain, rate_hz, lag
         self._in_batches = self.settings.track.mode == "paper" and wants_torch(backend)
         if self._in_batches and lag is not None:
             raise InputError(
-                "lag=0 cannot work with track.mode = paper in torch, which settles frames in batches; "
-                "take backend='onboard'"
+                "provisional tracks (lag=0, --latency now) cannot work with track.mode = paper in torch, which settles "
+                "frames in batches; take the backend onboard"
             )
         self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None

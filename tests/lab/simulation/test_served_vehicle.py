@@ -158,5 +158,5 @@ def test_a_late_command_waits_for_its_arrival():
     flown = Flown(LinkConditions(latency=50.0))
     flown.wire.say(command_int(ROI, GOAL, 0.0), *STATION)
     assert flown.step() is None
-    flown.vehicle._waiting[0] = -math.inf, flown.vehicle._waiting[0][1]
+    flown.vehicle._inbox._waiting[0] = -math.inf, flown.vehicle._inbox._waiting[0][1]
     assert flown.step().look_at == pytest.approx(GOAL, abs=1e-6)

@@ -15,7 +15,7 @@ from urllib.parse import SplitResult, parse_qsl, urlsplit
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams.outlets import LAST_S, KeptOutlet
 
-with suppress(ImportError):  # without it, what is under way when a connection breaks is not counted
+with suppress(ImportError):  # without it, messages under way when a connection breaks are not counted
     import fcntl
     import termios
 

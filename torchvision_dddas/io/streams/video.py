@@ -15,18 +15,22 @@ from torchvision_dddas.io.telemetry import VMTI, VmtiTarget, encode_flight, enco
 from torchvision_dddas.io.video_packets import TransportStream, VideoEncoder, VideoPacket, check_encoder
 from torchvision_dddas.types import AerialLocations, Flight, FrameResult, TrackedFrame
 
-_DATAGRAM = 7 * 188  # bytes: the usual seven packets
+_PACKET_BYTES = 188
+_USUAL_PACKETS = 7  # in a datagram
 _BURST = 24  # datagrams at once, because the buffers of receivers are small
 _FLAT_SINE = 0.01  # a camera that looks less below the horizon has no middle on the ground
 
 
 class VideoMessages:
-    """Encodes a result as datagrams of the stream. `packets` and `encoder` are those of its annotated picture."""
+    """Encodes a result as datagrams of the stream.
+
+    packets, encoder: those of its annotated picture. about: a thread of its own may put its own record here.
+    """
 
     def __init__(self, about: About) -> None:
         self.packets: Sequence[VideoPacket] = ()
         self.encoder: VideoEncoder | None = None
-        self._about = about
+        self.about = about
         self._of: VideoEncoder | None = None  # the encoder of the open stream
 
     def __call__(
@@ -37,9 +41,11 @@ class VideoMessages:
             return []
         if self.encoder is not self._of:
             self._of, self._stream = self.encoder, TransportStream(self.encoder)
-        metadata = encode_result(result, self._about, self.encoder.size_px)
+        metadata = encode_result(result, self.about, self.encoder.size_px)
         content = self._stream.mux(self.packets, metadata, self.packets[0].pts)
-        return [content[place : place + _DATAGRAM] for place in range(0, len(content), _DATAGRAM)]
+        packets = min(most_bytes // _PACKET_BYTES, _USUAL_PACKETS) if most_bytes else _USUAL_PACKETS
+        size = packets * _PACKET_BYTES
+        return [content[place : place + size] for place in range(0, len(content), size)]
 
 
 def encode_result(result: FrameResult, about: About, size_px: tuple[int, int]) -> bytes:

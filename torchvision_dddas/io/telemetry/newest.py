@@ -29,6 +29,7 @@ from torchvision_dddas.types import Telemetry
 _WINDOW_S, _MOST, _LEAST = 8.0, 600, 12
 _SWAPPED_S = 5.0  # reports that come in another order than they were made differ by this time at most
 _AHEAD_S, _SET_AFTER = 60.0, 3  # how far a time may jump ahead; so many odd times in a row are those of a set clock
+_RECENT = 25  # packets that give the delay of pictures
 _NAMES_MOST = 500  # columns that are read of JSON
 # gpsd's TPV reports, whose names are ambiguous elsewhere; its estimates of errors have no stated probability.
 _GPSD = {"time": "time", "lat": "latitude_deg", "lon": "longitude_deg", "speed": "speed_m_s", "altMSL": "above_sea_m"}
@@ -66,11 +67,12 @@ class ReportWindow:
     """The newest reports of one link, all of one kind, which the first usable report decides.
 
     name: of the link, for messages. time_zone, order: as for `read_telemetry`. system: the vehicle whose MAVLink
-    messages are taken; 0: the first autopilot whose heartbeat comes.
+    messages are taken; 0: the first autopilot whose heartbeat comes. delay_s: from the stamps of KLV packets to the
+    times of their pictures, by this machine's clock; NaN for other reports.
     """
 
     def __init__(self, name: str, time_zone: str = "", order: str = "auto", system: int = 0) -> None:
-        self.name, self.kind, self.system = name, "", system
+        self.name, self.kind, self.system, self.delay_s = name, "", system, math.nan
         self._zone, self._order = parse_time_zone(time_zone), order
         self._header = b""  # of a CSV
         self._reports: deque[tuple[float, bytes]] = deque(maxlen=_MOST)
@@ -187,13 +189,23 @@ class ReportWindow:
 
     def _clock(self, log: Telemetry) -> dict[str, Any]:
         start_utc_s = log.start_utc_s
-        if self.kind == "klv":  # the times of the stream, which it shares with the pictures, count
-            found = ((came_s, one) for came_s, packet in self._reports for one in local_sets(packet))
-            start_utc_s += float(np.nanmedian([came_s - stamp_s(one.tags.get(2)) for came_s, one in found]))
-        elif math.isnan(start_utc_s):  # times of an own table may count from 1970
-            start_utc_s = 0.0 if is_clock(log.time_s[-1]) else self.came_s - float(log.time_s[-1])
         unknown = {"start_utc_s": 0.0, "start_local_s": math.nan, "latest_utc_s": math.nan}
+        if self.kind == "klv":
+            return {"time_s": self._picture_times(log.time_s + start_utc_s), **unknown}
+        if math.isnan(start_utc_s):  # times of an own table may count from 1970
+            start_utc_s = 0.0 if is_clock(log.time_s[-1]) else self.came_s - float(log.time_s[-1])
         return {"time_s": log.time_s + start_utc_s, **unknown}
+
+    def _picture_times(self, utc_s: np.ndarray) -> np.ndarray:
+        """Return the times of the pictures with which KLV came that has the stamps utc_s. Measure delay_s."""
+        found = ((came_s, one) for came_s, packet in self._reports for one in local_sets(packet))
+        pairs = np.array([(stamp_s(one.tags.get(2)), came_s) for came_s, one in found])
+        stamps, came = pairs[np.isfinite(pairs[:, 0])].T
+        # The reader changes stamps that count other units than the standard's.
+        stamps = stamps * 1000.0 ** round(math.log(np.median(utc_s) / np.median(stamps), 1000))
+        self.delay_s = float(np.median((came - stamps)[-_RECENT:]))
+        order = np.argsort(stamps, kind="stable")
+        return np.interp(utc_s, stamps[order], np.maximum.accumulate(came[order]))
 
 
 def _in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

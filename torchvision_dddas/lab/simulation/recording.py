@@ -75,7 +75,7 @@ def record_scenario(
     with _RecordingOutput(folder, save) as output, ExitStack() as stack:
         with name_scenario_in_errors(name):
             simulator = open_simulator(scenario)
-        server = None if serve is None else stack.enter_context(SimulatorServer(serve, scenario))
+        server = None if serve is None else stack.enter_context(SimulatorServer(serve, scenario, simulator.names))
         count = min(simulator.frames, frames or simulator.frames)
         record = output.begin(simulator, count, serve)
         shown = nullcontext(lambda: None) if progress is None else progress(Path(name).stem, count)

@@ -15,6 +15,7 @@ from torchvision_dddas.lab.simulation.instrument_faults import Instruments, pars
 from torchvision_dddas.lab.simulation.link_conditions import DelayedWriter, LinkConditions, LinkDelay, parse_link
 from torchvision_dddas.lab.simulation.scenario import Scenario
 from torchvision_dddas.lab.simulation.served_camera import CameraStream, StreamSender
+from torchvision_dddas.lab.simulation.served_team import ServedTeam
 from torchvision_dddas.lab.simulation.served_vehicle import COMPONENT, SYSTEM, ServedVehicle
 from torchvision_dddas.lab.simulation.simulator import Shot, Simulator
 
@@ -24,7 +25,7 @@ _LATE_S = 0.5  # a delay of the world up to this time is not noted
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """The options of a served world, as given. pictures: URL of the camera. vehicle: MAVLink connection of the UAV."""
+    """The options of a served world, as given. pictures: URL of the camera. vehicle: MAVLink link of all vehicles."""
 
     pictures: str | None = None
     vehicle: str | None = None
@@ -39,8 +40,11 @@ class SimulatorServer:
     late_s: time by which the world fell behind its clock, because drawing takes longer than a frame lasts.
     """
 
-    def __init__(self, options: ServeOptions, scenario: Scenario) -> None:
-        """Open the devices. Raise InputError for bad options, and for addresses that cannot be opened."""
+    def __init__(self, options: ServeOptions, scenario: Scenario, names: tuple[str, ...] = ()) -> None:
+        """Open the devices. names: of the ground vehicles.
+
+        Raise InputError for bad options, and for addresses that cannot be opened.
+        """
         if not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
             raise InputError(f"--speed must be between {_SPEEDS[0]:g} and {_SPEEDS[1]:g}, got {options.speed:g}")
         conditions = LinkConditions() if options.link is None else parse_link(options.link)
@@ -50,8 +54,9 @@ class SimulatorServer:
         self._due_s, self.late_s = -math.inf, 0.0
         self._stream: CameraStream | None = None
         self._vehicle: ServedVehicle | None = None
+        self._team: ServedTeam | None = None
         self.notes: list[str] = []
-        delays = [LinkDelay(conditions, scenario.seed, stream) for stream in range(3)]
+        delays = [LinkDelay(conditions, scenario.seed, stream) for stream in range(5)]
         with ExitStack() as opening:
             if options.pictures is not None:
                 sender = StreamSender(options.pictures)
@@ -67,6 +72,9 @@ class SimulatorServer:
                 link = opening.enter_context(open_mavlink(address, self._note, "--serve-mavlink"))
                 reports = opening.enter_context(DelayedWriter(partial(_send, link), delays[1]))
                 self._vehicle = ServedVehicle(link, reports, delays[2])
+                if names:
+                    send = opening.enter_context(DelayedWriter(partial(_send_from, link), delays[3]))
+                    self._team = ServedTeam(link, send, delays[4], names, scenario.team.patrol_m_s)
             self._open = opening.pop_all()
 
     def show(self, simulator: Simulator, shot: Shot) -> float:
@@ -87,8 +95,13 @@ class SimulatorServer:
             place_m = moment.pose.place_m
             up_m = float(place_m[2] - simulator.world.up_m(place_m[None, :2])[0])
             command = self._vehicle.step(moment.pose, up_m, self._origin, flight)
-            if command is not None:
-                simulator.steer(command)
+            orders = None
+            if self._team is not None:
+                ground_sea_m = 0.0 if moment.flight is None else moment.flight.above_sea_m - moment.flight.altitude_m
+                orders = self._team.step(moment, ground_sea_m)
+            for one in (command, orders):
+                if one is not None:
+                    simulator.steer(one)
         return shown_s
 
     def __enter__(self) -> Self:
@@ -105,3 +118,7 @@ class SimulatorServer:
 
 def _send(link: MavlinkLink, message: Any) -> None:
     link.send(message, SYSTEM, COMPONENT)
+
+
+def _send_from(link: MavlinkLink, item: tuple[int, Any]) -> None:
+    link.send(item[1], item[0], COMPONENT)
