@@ -57,7 +57,7 @@ def test_each_client_gets_the_lines_from_now_on(served):
 def test_the_end_of_a_run_sends_the_last_lines_and_closes_the_connection(served):
     closed = pytest.importorskip("websockets.exceptions").ConnectionClosedOK
     lines, host = served
-    with connect(host, max_queue=None) as client:
+    with connect(host, max_queue=200) as client:
         until(lambda: lines._clients)
         for number in range(1, 51):
             lines.write(result(number, [(1, 2)]), None, 1.6e9)

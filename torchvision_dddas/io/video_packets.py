@@ -88,12 +88,15 @@ class VideoFile:
             self._part.discard()
             raise
         self.begin = self.end = -1
+        self._last_for = round(HZ / float(encoder.stream.codec_context.framerate))
 
     def write(self, packet: VideoPacket) -> None:
         """Add a packet; the first is a key picture. Raise OSError if the disk refuses."""
         self.begin = packet.pts if self.begin < 0 else self.begin
         self.end = packet.pts
-        self._container.mux(_stamped(self._stream, packet, self.begin))
+        made = _stamped(self._stream, packet, self.begin)
+        made.duration = self._last_for  # without it players leave out the last picture
+        self._container.mux(made)
 
     def close(self) -> None:
         """Finish the file, and move it to its place. Raise OSError if the disk refuses."""
