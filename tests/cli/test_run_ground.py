@@ -61,6 +61,7 @@ def test_an_interrupted_run_keeps_what_its_platforms_did(dddas, clip, engine, fi
     assert record(out)["state"] == "interrupted" and record(out)["platforms"]["ugv1"]["frames"] > 0
 
 
+@pytest.mark.slow
 def test_live_runs_that_drop_nothing_have_the_tables_of_offline_runs(
     dddas, clip, engine, file, platform, tmp_path, monkeypatch
 ):
