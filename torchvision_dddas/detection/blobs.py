@@ -17,6 +17,13 @@ def box_slices(box: Box, left: int = 0, top: int = 0) -> tuple[slice, slice]:
     return slice(y - top, y - top + height), slice(x - left, x - left + width)
 
 
+def widen_box(box: Box, margin_px: int, size: tuple[int, int]) -> Box:
+    """Return a box with a margin on each side, clipped to a picture of size (width, height)."""
+    x, y, width, height = box
+    left, top = max(x - margin_px, 0), max(y - margin_px, 0)
+    return left, top, min(x + width + margin_px, size[0]) - left, min(y + height + margin_px, size[1]) - top
+
+
 @dataclass(frozen=True)
 class Blob:
     """A connected region of the core mask.

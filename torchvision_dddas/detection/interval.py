@@ -253,7 +253,7 @@ def settings_at(flight: Flight | None, rate_hz: float, base: Settings) -> Distan
             base = with_parameters(base, {"small.on": False})
         return DistanceSettings(base, person_px=size_px, tiny=tiny)
     gates, small, gap, close_px = base.gates, base.small, base.small.gap_frames, base.morphology.close_px
-    scale = pixels_per_metre(flight.distance_m, gates.focal_px)
+    scale = float(pixels_per_metre(flight.distance_m, gates.focal_px))
     square = (gates.expected_size_m * scale) ** 2
     if base.morphology.close_m:
         close_px = int(np.clip(round(base.morphology.close_m * scale), 1, close_px))

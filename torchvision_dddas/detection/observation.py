@@ -15,6 +15,7 @@ from torchvision_dddas.detection.blobs import (
     box_slices,
     fill_hull,
     find_blobs,
+    widen_box,
 )
 from torchvision_dddas.detection.candidates import SILHOUETTES, Candidates, Evidence, find_candidates
 from torchvision_dddas.detection.engine import Foreground
@@ -140,7 +141,8 @@ def _draw_candidate(here: Observation, index: int, velocity_px: np.ndarray, scor
     window, foreground, candidates = here.window, here.foreground, here.candidates
     assert window is not None and foreground is not None and candidates is not None  # dropped only after drawing
     silhouette = SILHOUETTES[candidates.silhouette[index]]
-    box = _widen(candidates.box_px[index].astype(int).tolist(), silhouette.erode_px // 2, window.reference.size)
+    found: Box = tuple(candidates.box_px[index].astype(int).tolist())
+    box = widen_box(found, silhouette.erode_px // 2, window.reference.size)  # erosion made the candidate narrower
     evidence = _evidence_by_gap(window, foreground, box_slices(box))
     seen = [picture for picture in (evidence[gap] for gap in silhouette.gaps) if picture is not None]
     core = np.max(seen, axis=0) > silhouette.threshold * EVIDENCE_SCALE
@@ -151,13 +153,6 @@ def _draw_candidate(here: Observation, index: int, velocity_px: np.ndarray, scor
     part = np.s_[top : top + height, left : left + width]
     box = (box[0] + left, box[1] + top, width, height)
     return Target(box, mask[part], velocity_px, score, (core & mask)[part])
-
-
-def _widen(box: Sequence[int], margin_px: int, size: tuple[int, int]) -> Box:
-    """Return a box with a margin inside a picture of size (width, height): erosion made the candidate narrower."""
-    x, y, width, height = box
-    left, top = max(x - margin_px, 0), max(y - margin_px, 0)
-    return left, top, min(x + width + margin_px, size[0]) - left, min(y + height + margin_px, size[1]) - top
 
 
 def _without_shadow(mask: np.ndarray, box: Box, area_px: int, window: Window[View], settings: Settings) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from torchvision_dddas.chain import View, ellipse
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings
-from torchvision_dddas.detection.blobs import Blob, Box, box_slices
+from torchvision_dddas.detection.blobs import Blob, Box, box_slices, widen_box
 from torchvision_dddas.detection.engine import Foreground
 
 _MAX_MISFIT = 15.0  # noise units
@@ -46,7 +46,7 @@ def refine_outlines(
     """
     seeds, guides = [], []
     for blob, velocity_px in zip(blobs, velocities_px, strict=True):
-        left, top, width, height = _surroundings(blob.box, view.size)
+        left, top, width, height = widen_box(blob.box, _PAD, view.size)
         here: np.ndarray = np.zeros((height, width, 2), np.float32)
         here[..., 1] = 1
         here[box_slices(blob.box, left, top)] = np.dstack(
@@ -59,17 +59,10 @@ def refine_outlines(
     weights = smooth_along_edges(seeds, guides, settings.refine.spatial_px / 2, settings.refine.colour_levels)
     masks = []
     for blob, weight in zip(blobs, weights, strict=True):
-        left, top, width, height = _surroundings(blob.box, view.size)
+        left, top, width, height = widen_box(blob.box, _PAD, view.size)
         share = cv2.resize(weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6), (width, height))
         masks.append((share[box_slices(blob.box, left, top)] > settings.refine.share) & blob.mask)
     return masks
-
-
-def _surroundings(box: Box, size: tuple[int, int]) -> Box:
-    """Return the box extended by a margin of _PAD, and clipped to the picture (width, height)."""
-    x, y, width, height = box
-    left, top = max(x - _PAD, 0), max(y - _PAD, 0)
-    return left, top, min(x + width + _PAD, size[0]) - left, min(y + height + _PAD, size[1]) - top
 
 
 def _explain_pixels(

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.types import Flight
+from torchvision_dddas.types import Flight, ground_distance
 
 BODY_M = 1.7, 0.5
 """Height and width of a person."""
@@ -18,8 +18,6 @@ _SIDE_SPREAD, _MISFIT = 0.3, 2.0
 # Log odds of a person's size. A vehicle's size counts 0, because large boxes also show groups of people, trees and
 # buildings. Thermal clips alone would give 1.5 to 2, simulated flights 0.8 to 1.
 _FIT = 1.0
-# Ground nearer to the horizon, before or behind the camera, is too far to tell.
-_LEAST_BELOW_RAD = 0.1
 
 TINY: dict[str, object] = {
     # People are as small as the texture of the ground, so no kernel may be wider than a person.
@@ -37,9 +35,9 @@ TINY: dict[str, object] = {
 """Detection parameters for pictures in which people are smaller than `gates.tiny_px`."""
 
 
-def pixels_per_metre(distance_m: float, focal_px: float) -> float:
-    """Return the scale, px a metre, at a distance. Distances below 1 m count as 1 m, so that the scale stays finite."""
-    return focal_px / max(distance_m, 1.0)
+def pixels_per_metre(distance_m: Any, focal_px: float) -> Any:
+    """Return the scale, px a metre, at distances. Distances below 1 m count as 1 m, so that the scale stays finite."""
+    return focal_px / np.maximum(distance_m, 1.0)
 
 
 def person_px(flight: Flight, focal_px: float) -> float:
@@ -48,8 +46,7 @@ def person_px(flight: Flight, focal_px: float) -> float:
     A camera that looks straight down sees only the shoulders. An unknown pitch counts as straight down.
     """
     pitch = flight.pitch_rad if math.isfinite(flight.pitch_rad) else math.pi / 2
-    length_m = float(_seen_length(pitch))
-    return math.sqrt(length_m * BODY_M[1]) * pixels_per_metre(flight.distance_m, focal_px)
+    return float(np.sqrt(_seen_length(pitch) * BODY_M[1]) * pixels_per_metre(flight.distance_m, focal_px))
 
 
 def score_size(box_px: np.ndarray, flight: Flight, focal_px: float, height_px: int) -> np.ndarray:
@@ -59,8 +56,8 @@ def score_size(box_px: np.ndarray, flight: Flight, focal_px: float, height_px: i
     """
     pitch = flight.pitch_rad if math.isfinite(flight.pitch_rad) else math.pi / 2
     below_axis = np.arctan((box_px[:, 1] + box_px[:, 3] - height_px / 2) / focal_px)
-    below_horizon = np.clip(pitch + below_axis, _LEAST_BELOW_RAD, math.pi - _LEAST_BELOW_RAD)
-    metre = focal_px * np.sin(below_horizon) / (max(flight.altitude_m, 1.0) * np.cos(below_axis))
+    below_horizon = pitch + below_axis
+    metre = pixels_per_metre(ground_distance(flight.altitude_m, below_horizon) * np.cos(below_axis), focal_px)
     body = metre * np.sqrt(_seen_length(below_horizon) * BODY_M[1])
     side = np.sqrt(box_px[:, 2] * box_px[:, 3])
 

@@ -1,6 +1,6 @@
 """Encode pictures as H.264 once, and put the packets into several files and streams. It needs PyAV (extra `video`)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -34,6 +34,46 @@ def check_encoder(option: str) -> None:
         raise InputError(f"{option} needs PyAV: pip install 'torchvision-dddas[video]'") from None
 
 
+def usual_rate(rate_hz: float) -> Fraction:
+    """Return the rate of a video, from 1 to 240 pictures a second, as a fraction that containers can hold."""
+    return Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
+
+
+def add_h264(container: Any, size_px: tuple[int, int], rate: Fraction, options: Mapping[str, str] | None = None) -> Any:
+    """Add a stream of H.264 to a container of PyAV, and return it. size_px: (width, height), both even.
+
+    options: options of x264 beside the usual ones, or in place of them.
+    """
+    # Look-ahead would hold tens of frames in memory. The preset takes 3.1 ms of processor time a frame at 768x576, and
+    # `veryfast` takes 7.5 ms. With this preset, the file is 1.5 times as large.
+    usual = {"preset": "ultrafast", "tune": "zerolatency", "crf": "22"}
+    stream = container.add_stream("libx264", rate=rate, options={**usual, **(options or {})})
+    stream.width, stream.height = size_px
+    stream.pix_fmt = "yuv420p"
+    stream.codec_context.thread_count = 2  # so memory does not depend on the number of cores
+    return stream
+
+
+def pad_to_even(picture: np.ndarray) -> np.ndarray:
+    """Return a picture with an even number of rows and columns: repeat the last one of an odd number.
+
+    H.264 stores colour for blocks of 2×2 pixels.
+    """
+    height, width = picture.shape[:2]
+    if not (height % 2 or width % 2):
+        return picture
+    return cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+
+
+def frame_of(picture: np.ndarray) -> Any:
+    """Return the frame of PyAV for a picture, (H, W, 3) uint8 BGR, with even H and W."""
+    import av
+
+    # OpenCV's conversion is as quick as FFmpeg's and needs no second copy of the picture in colour.
+    planes = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).astype(np.uint8, copy=False)
+    return av.VideoFrame.from_ndarray(planes, format="yuv420p")
+
+
 class VideoEncoder:
     """Encodes pictures of one size at their own times. stream: the template of streams that take its packets."""
 
@@ -43,19 +83,14 @@ class VideoEncoder:
 
         self.size_px, self._av = size_px, av
         self._container: Any = av.open(_Nowhere(), "w", format="h264")
-        options = {"preset": "ultrafast", "tune": "zerolatency", "crf": f"{factor}", "forced-idr": "1"}
-        options["x264-params"] = "repeat-headers=1"
-        rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
-        self.stream: Any = self._container.add_stream("libx264", rate=rate, options=options)
-        self.stream.width, self.stream.height = size_px
-        self.stream.pix_fmt, self.stream.codec_context.time_base = "yuv420p", Fraction(1, HZ)
-        self.stream.codec_context.thread_count = 2  # so memory does not depend on the number of cores
+        options = {"crf": f"{factor}", "forced-idr": "1", "x264-params": "repeat-headers=1"}
+        self.stream: Any = add_h264(self._container, size_px, usual_rate(rate_hz), options)
+        self.stream.codec_context.time_base = Fraction(1, HZ)
         self._last, self._due = -1, 0
 
     def encode(self, picture: np.ndarray, time_s: float) -> list[VideoPacket]:
         """Return the packets of a picture (H, W, 3) BGR. A time that does not grow is moved behind the last one."""
-        planes = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).astype(np.uint8, copy=False)
-        frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        frame = frame_of(picture)
         frame.pts = self._last = max(round(time_s * HZ), self._last + 1)
         frame.time_base = Fraction(1, HZ)
         if frame.pts >= self._due:

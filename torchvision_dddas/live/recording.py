@@ -12,12 +12,11 @@ from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.io.overlay import RunPictures
 from torchvision_dddas.io.streams import About, Stream
-from torchvision_dddas.io.video_packets import HZ, VideoEncoder, VideoFile, VideoPacket
+from torchvision_dddas.io.video_packets import HZ, VideoEncoder, VideoFile, VideoPacket, pad_to_even
 from torchvision_dddas.live.operator_view import draw_result
 from torchvision_dddas.live.team import give_way
 from torchvision_dddas.types import Frame, FrameResult, TrackedFrame, Zone, is_sampled
@@ -158,9 +157,7 @@ class Recorder:
             self._encoder = VideoEncoder(even, self._rate_hz)
             self._pictures = RunPictures((width, height), self._about.landmarks, self._zones)
         picture = draw_result(self._pictures, result, people, image)
-        if even != (width, height):  # colour is stored for blocks of 2×2 pixels
-            picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-        return self._encoder.encode(picture, result.frame.time_s)
+        return self._encoder.encode(pad_to_even(picture), result.frame.time_s)
 
     def _end(self, outputs: Sequence[PacketOutput], error: Exception) -> None:
         for output in tuple(outputs):

@@ -41,7 +41,7 @@ from torchvision_dddas.types.ground import (
 from torchvision_dddas.types.people import LinearSvm, Part, People, PeopleFrame
 from torchvision_dddas.types.record import Record
 from torchvision_dddas.types.table import Boxes, Table
-from torchvision_dddas.types.telemetry import COLUMNS_OF_TELEMETRY, Flight, Telemetry
+from torchvision_dddas.types.telemetry import COLUMNS_OF_TELEMETRY, Flight, Telemetry, ground_distance
 from torchvision_dddas.types.tracks import AppearanceUse, FrameResult, TrackedFrame, Tracks
 from torchvision_dddas.types.views import SharedFrame, ViewMap, identities_of
 from torchvision_dddas.types.worlds import Bodies, Command, GroundPicture, Order, Truth
@@ -102,6 +102,7 @@ __all__ = [
     "are_corners",
     "as_picture",
     "check_boxes",
+    "ground_distance",
     "identities_of",
     "is_sampled",
     "most_common",

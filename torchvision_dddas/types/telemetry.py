@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types.record import Record
@@ -143,6 +144,14 @@ _TURN = 2 * math.pi
 _LEAST_SINE = 0.1  # smallest sine of the angle of the view below the horizon
 
 
+def ground_distance(altitude_m: float, below_horizon_rad: ArrayLike) -> np.ndarray:
+    """Return the distances, m, to level ground along lines of sight at angles (...) below the horizon.
+
+    An angle of less than about 6 degrees counts as 6 degrees, because its ground is too far to tell.
+    """
+    return altitude_m / np.maximum(np.sin(below_horizon_rad), _LEAST_SINE)
+
+
 def _wrap(value: float, full: float) -> float:
     """Return a value or difference on a circle of circumference `full`, from minus half of it to half."""
     return value if abs(value) <= full / 2 or full == math.inf else (value + full / 2) % full - full / 2
@@ -193,8 +202,8 @@ class Flight(Record):
     def distance_m(self) -> float:
         """Distance from the camera to level ground along the optical axis; the altitude if the pitch is unknown.
 
-        A view less than about 6 degrees below the horizon counts as 6 degrees, because its ground is too far to tell.
+        See `ground_distance`.
         """
         if not math.isfinite(self.pitch_rad):
             return self.altitude_m
-        return self.altitude_m / max(math.sin(self.pitch_rad), _LEAST_SINE)
+        return float(ground_distance(self.altitude_m, self.pitch_rad))
