@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -196,33 +197,42 @@ def test_results_have_the_times_of_exposure_by_the_stamps_of_klv_unless_its_cloc
     assert "are 61 s after the pictures come: results have the times of reception" in said[1]
 
 
+class WithMetadata(FakeStream):
+    """Pictures with time stamps and metadata. stamp, packet: those of a picture. wait_s: time before the k-th one."""
+
+    stamp_s = float("nan")
+
+    def __init__(
+        self,
+        clock: FakeClock,
+        stamp: Callable[[int], float],
+        packet: Callable[[int], tuple[float, bytes]],
+        wait_s: Callable[[int], float],
+    ) -> None:
+        pause = partial(time.sleep, 0.001)
+        super().__init__((step for k in itertools.count() for step in (wait_s(k), pause, k % 200)), clock=clock)
+        self._stamp, self._packet, self.count = stamp, packet, 0
+        self.metadata: deque[tuple[float, bytes]] = deque()
+
+    def grab(self) -> bool:
+        came = super().grab()
+        self.stamp_s = self._stamp(self.count)
+        self.metadata.append(self._packet(self.count))
+        self.count += 1
+        return came
+
+
 def test_metadata_waits_for_the_picture_with_its_stamp_and_has_its_time():
     clock = FakeClock()
 
-    class Irregular(FakeStream):
-        """Pictures whose stamps are irregular. The packet of a picture comes with the picture before it."""
+    def stamp(count: int) -> float:
+        return 5000 + 0.04 * count + 0.007 * (count % 3)  # irregular, as the times of the pictures are
 
-        stamp_s = float("nan")
+    def packet(count: int) -> tuple[float, bytes]:  # the packet of a picture comes with the picture before it
+        return stamp(count + 1), b"%d" % (count + 1)
 
-        def __init__(self) -> None:
-            pause = partial(time.sleep, 0.001)
-            super().__init__(
-                (step for k in itertools.count() for step in (0.03 + 0.02 * (k % 2), pause, k % 200)), clock=clock
-            )
-            self.metadata: deque[tuple[float, bytes]] = deque()
-            self.count = 0
-
-        def at(self, count: int) -> float:
-            return 5000 + 0.04 * count + 0.007 * (count % 3)
-
-        def grab(self) -> bool:
-            came = super().grab()
-            self.stamp_s = self.at(self.count)
-            self.metadata.append((self.at(self.count + 1), b"%d" % (self.count + 1)))
-            self.count += 1
-            return came
-
-    source = LiveSource("fake", LiveParameters(lost_s=1.0), opener=Streams(Irregular()), clock=clock)
+    stream = WithMetadata(clock, stamp, packet, lambda k: 0.03 + 0.02 * (k % 2))
+    source = LiveSource("fake", LiveParameters(lost_s=1.0), opener=Streams(stream), clock=clock)
     try:
         packets, shown = dict[bytes, float](), set[float]()
         for frame in source:
@@ -240,23 +250,11 @@ def test_metadata_waits_for_the_picture_with_its_stamp_and_has_its_time():
 def test_packets_of_metadata_have_the_times_of_the_pictures_with_their_stamps():
     clock = FakeClock()
 
-    class WithMetadata(FakeStream):
-        stamp_s = float("nan")
+    def stamp(count: int) -> float:
+        return 5000 + 0.04 * count
 
-        def __init__(self) -> None:
-            pause = partial(time.sleep, 0.001)
-            super().__init__((step for k in itertools.count() for step in (0.04, pause, k % 200)), clock=clock)
-            self.metadata: deque[tuple[float, bytes]] = deque()
-            self.count = 0
-
-        def grab(self) -> bool:
-            came = super().grab()
-            self.stamp_s = 5000 + 0.04 * self.count
-            self.metadata.append((self.stamp_s - 0.02, b"%d" % self.count))
-            self.count += 1
-            return came
-
-    source = LiveSource("fake", LiveParameters(lost_s=1.0), opener=Streams(WithMetadata()), clock=clock)
+    stream = WithMetadata(clock, stamp, lambda count: (stamp(count) - 0.02, b"%d" % count), lambda k: 0.04)
+    source = LiveSource("fake", LiveParameters(lost_s=1.0), opener=Streams(stream), clock=clock)
     try:
         assert source.metadata is not None
         packets: list[tuple[float, bytes]] = []

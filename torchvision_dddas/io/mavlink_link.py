@@ -35,7 +35,7 @@ _SIGNING_EPOCH_S = 1_420_070_400  # signing times count 10 us steps from 2015-01
 
 
 class Port(Protocol):
-    """An open connection. OSError is raised by all calls when it is lost."""
+    """An open connection. All calls raise OSError once the connection is lost."""
 
     def read(self) -> tuple[Any, bytes]:
         """Return the sender's address and bytes; wait for a short time, then return no bytes."""
@@ -221,7 +221,7 @@ class MavlinkLink:
 
     def _message(self, frame: bytearray) -> Any:
         """Decode a frame. Return None if it is damaged, and _REFUSED if its signature is missing or wrong."""
-        # Garbage of the first byte begins a frame at each byte. Its length is checked sooner than its checksum.
+        # In a row of 0xFE bytes each byte may start a frame. Check the stated length first: a checksum costs more.
         known = self.dialect.mavlink_map.get(frame[5]) if frame[0] == _V1 else None
         if known is not None and frame[1] > known.unpacker.size:
             return None

@@ -89,7 +89,7 @@ class VideoEncoder:
         self._last, self._due = -1, 0
 
     def encode(self, picture: np.ndarray, time_s: float) -> list[VideoPacket]:
-        """Return the packets of a picture (H, W, 3) BGR. A time that does not grow is moved behind the last one."""
+        """Return the packets of a picture (H, W, 3) BGR. Each time is moved behind the one before."""
         frame = frame_of(picture)
         frame.pts = self._last = max(round(time_s * HZ), self._last + 1)
         frame.time_base = Fraction(1, HZ)
@@ -100,7 +100,7 @@ class VideoEncoder:
 
 
 class _Nowhere:
-    """A file that keeps nothing: the container exists for its encoder only."""
+    """A file that discards its content. The container is needed for its encoder only."""
 
     def write(self, content: bytes) -> int:
         return len(content)

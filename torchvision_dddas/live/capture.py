@@ -161,7 +161,7 @@ class Player:
         self._health, self._clock = health, clock
         self.seeking, self._concealed = False, 0
         if isinstance(recording, (VideoSource, ImageSource)):
-            recording.tolerant = True  # leave out single pictures of another size
+            recording.tolerant = True  # a single picture of another size is skipped
         self.apart_s = 1 / (recording.rate_hz * pace) if pace else 0.0
         self.threads = [threading.Thread(target=self._play, name="playing", daemon=True)]
 

@@ -35,7 +35,7 @@ class CotInput(Lines):
                 "landmark, such as cot:udp:0.0.0.0:4242?ugv1=ALPHA&ugv2=BRAVO"
             )
         if not len(names) == len(uids) == len(pairs):
-            raise InputError(f"--landmarks {text}: each landmark and each uid may stand there once")
+            raise InputError(f"--landmarks {text}: name each landmark and each uid only once")
         self.names: Mapping[str, str] = {uid: name for name, _, uid in pairs}
         opener = port_opener(found[1], found[2], f"--landmarks {text}")
         super().__init__(text, opener, notify, option="--landmarks")
@@ -53,7 +53,7 @@ class CotInput(Lines):
             self._rest = b""
 
     def _read(self, content: bytes) -> Iterator[bytes]:
-        """Yield the report of a landmark; a damaged event is yielded as it is, so that it is told."""
+        """Yield the report of a landmark, and yield a damaged event as it is, so that the caller reports it."""
         try:
             if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
                 raise ValueError

@@ -15,7 +15,7 @@ from torchvision_dddas.types import FrameResult, TrackedFrame
 _MOST_CLIENTS = 8
 _KEPT = 100  # lines that wait for a slow client, which misses the oldest then
 _POLL_S = 0.02
-_LAST_S = 2.0  # for the last lines at the end of a run
+_LAST_S = 2.0  # time for the last lines at the end of a run
 
 
 class LineSocket:
@@ -31,7 +31,7 @@ class LineSocket:
         """Encode a result if a client is there. start_utc_s: as in `About`, for this result."""
         if not self._clients:
             return
-        about = replace(self._about, start_utc_s=start_utc_s)  # the thread of the streams sets that of its own results
+        about = replace(self._about, start_utc_s=start_utc_s)  # another thread changes self._about
         age_s = math.nan if result.frame is None else time.monotonic() - result.frame.taken_s
         lines = json_lines(about, result, people, age_s)
         for client in tuple(self._clients):
@@ -68,7 +68,7 @@ class LineSocket:
         self._clients.append(lines)
         try:
             while not is_closing():
-                is_ended = self._is_ended  # read before the lines, so that the last lines are not left
+                is_ended = self._is_ended  # read this first, so that no line comes after the last look at the lines
                 while lines and protocol.state is protocol.state.OPEN:
                     protocol.send_text(lines.popleft().rstrip())
                 if is_ended and protocol.state is protocol.state.OPEN:
@@ -76,7 +76,7 @@ class LineSocket:
                 for content in protocol.data_to_send():
                     if content:
                         handler.connection.sendall(content)
-                    else:  # both sides have said that they close; the client waits for the end of the connection
+                    else:  # both sides have sent their close frames; the client now waits until the server disconnects
                         handler.connection.shutdown(socket.SHUT_WR)
                 is_answer_due = is_ended and protocol.state is protocol.state.CLOSING and protocol.close_rcvd is None
                 if protocol.state is not protocol.state.OPEN and not is_answer_due:
@@ -84,7 +84,7 @@ class LineSocket:
                 if select.select([handler.connection], [], [], _POLL_S)[0]:
                     content = handler.connection.recv(1 << 16)
                     protocol.receive_data(content) if content else protocol.receive_eof()
-                    protocol.events_received()  # what a client says is discarded
+                    protocol.events_received()  # messages of clients are discarded
         finally:
             self._clients.remove(lines)
         return ""

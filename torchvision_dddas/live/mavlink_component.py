@@ -184,7 +184,7 @@ class MavlinkComponent:
     def _video_information(self) -> Any:
         scheme, _, rest = self.video_uri.partition(":")
         kind = _VIDEO_TYPES.get(scheme)
-        # A ground station listens at the port of datagrams; the specification wants the port alone then.
+        # For a stream of UDP datagrams, the specification wants the port alone: the ground station listens there.
         uri = rest.rpartition(":")[2] if scheme == "udp" else self.video_uri
         if kind is None or len(uri) > 160:
             return None

@@ -41,18 +41,18 @@ MOST_TARGETS = 100
 _BOUNDARY = b"--picture\r\n"
 PICTURES = "multipart/x-mixed-replace; boundary=picture"
 """The content type of `OperatorView.pictures`."""
-_LONGEST_PX, _QUALITY = 960, 70  # of the encoded picture: its longer side, and its JPEG quality
+_LONGEST_PX, _QUALITY = 960, 70  # longest side and JPEG quality of the encoded picture
 _APART_S = 0.125  # least time between two pictures
-_MOST_WAITING = 16  # pictures whose results are not there yet
+_MOST_WAITING = 16  # pictures that wait for their results
 _IDLE_S = 0.5  # without a new picture, clients are checked this often
-_WAY_APART_S, _WAY_PLACES = 1.0, 60  # tracks on the map: a place a second, for a minute
+_WAY_APART_S, _WAY_PLACES = 1.0, 60  # the map shows one place of each track per second, for a minute
 _KINDS = {"moving": "mover", "given": "target"}
 
 
 class OperatorView:
     """The newest result of a run for the page, and a stream of annotated pictures.
 
-    `take` and `show` are called by the run, all else by threads of the server. session: distinguishes this run from
+    The run calls `take` and `show`. Threads of the server call the rest. session: distinguishes this run from
     others on the same port.
     """
 

@@ -55,7 +55,7 @@ class PacketOutput:
 
 
 class Recorder:
-    """Draws results, and gives their packets to outputs. `take`, `show` and `close` are called by the run.
+    """Draws results, and gives their packets to outputs. The run calls `take`, `show` and `close`.
 
     An output that fails ends with an event; the others and the run go on.
     """
@@ -274,7 +274,7 @@ class SentPictures(PacketOutput):
     """Sends packets through a stream of `--emit video:`, which the session closes."""
 
     def __init__(self, stream: Stream, about: About) -> None:
-        """about: that of the recorder."""
+        """about: the record that the recorder was given."""
         self.name, self._stream = stream.name, stream
         if stream.video is not None:
             stream.video.about = about

@@ -208,7 +208,9 @@ class _Handler(BaseHTTPRequestHandler):
             cookie = f"{cookie_name(port)}={access.token}; HttpOnly; SameSite=Lax; Max-Age=31536000"
             self._send(303, "text/plain", "", {"Location": "./", "Set-Cookie": cookie})
         elif isinstance(page := self.server.pages.get(path), LineSocket):
-            self.server.release(self.request)  # it lasts, so it is the oldest client soon
+            self.server.release(
+                self.request
+            )  # it stays connected: the oldest client would be disconnected for a new one
             if why := page.serve(self, lambda: self.server.is_closing):
                 self._send(503, "text/plain", why)
         elif page is not None:

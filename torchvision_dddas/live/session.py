@@ -130,7 +130,7 @@ class _Session:
             settings = with_parameters(settings, {"interval.cost": 0.0})
         self.settings, self.live = settings, settings.live
         self.health, self.supervisor = Health(), Supervisor()
-        for name in _COUNTED:  # a count that exists from the start can be distinguished from a missing one
+        for name in _COUNTED:  # readers can then tell a count of 0 from a missing count
             self.health.count(name, 0)
         self.watchdog = Watchdog(self.health, self.live.watchdog_s, self.supervisor)
         self.name = without_secrets(options.clip)
@@ -220,7 +220,9 @@ class _Session:
         if options.zones is not None:
             options.zones.check(locator is not None, None if locator is None else locator.site.origin_deg)
         ready.notes.extend(inputs.describe(ready))
-        Tracker(ready.settings, backend=ready.engine.name, lag=options.lag)  # refuses what cannot work
+        Tracker(
+            ready.settings, backend=ready.engine.name, lag=options.lag
+        )  # raises InputError for settings that lag=0 cannot use
         if options.lag is not None and ready.settings.crowds.join_m and locator is not None:
             raise InputError(
                 "--latency now cannot work with crowds.join_m, which gives crowds their identities later; leave one out"

@@ -43,7 +43,7 @@ def print_snapshot(now: Snapshot) -> None:
 
 
 def summarize(health: Health, folder: Path, deadline_ms: float) -> str:
-    """Return the last line of a run."""
+    """Return the last line of a run: the numbers of results, pictures and losses, the latency, and the folder."""
     now = health.snapshot()
     counts = {name: now.counts.get(name, 0) for name in ("results", "captured", "dropped", "late")}
     within = f", 99 % within {1000 * now.seconds['latency'][2]:.0f} ms" if "latency" in now.seconds else ""

@@ -72,7 +72,7 @@ def _join(first: TrackStates, *others: TrackStates) -> TrackStates:
 
 
 def _widen(signature: np.ndarray, width: int) -> np.ndarray:
-    """Widen unknown histograms (N, 0) to zeros (N, width); return others unchanged."""
+    """Replace unknown histograms, (N, 0), by zeros, (N, width). Return known histograms unchanged."""
     return signature if signature.shape[1] == width else np.zeros((len(signature), width), np.float32)
 
 

@@ -39,7 +39,7 @@ class KeyFrame:
 
     @property
     def when(self) -> str:
-        """Frame number and time for a reader."""
+        """The frame number and the time as text."""
         return f"frame {self.number}" + (f", {self.time_s:.1f} s" if math.isfinite(self.time_s) else "")
 
 

@@ -15,7 +15,7 @@ from urllib.parse import SplitResult, parse_qsl, urlsplit
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams.outlets import LAST_S, KeptOutlet
 
-with suppress(ImportError):  # without it, messages under way when a connection breaks are not counted
+with suppress(ImportError):  # without fcntl, messages lost with a connection are not counted
     import fcntl
     import termios
 
@@ -50,7 +50,7 @@ class StreamOutlet(KeptOutlet):
         self._socket: socket.socket | None = None
         self._is_open = False
         self._begun_s = self._settled_s = 0.0
-        self._passed_bytes = 0  # through this connection
+        self._passed_bytes = 0  # bytes sent through this connection
         self._ends = deque[int]()  # of the messages that are not acknowledged yet, counted like _passed_bytes
 
     def flush(self) -> None:

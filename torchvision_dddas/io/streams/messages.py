@@ -72,9 +72,9 @@ def json_lines(
 ) -> list[bytes]:
     """Return the lines of a frame, ASCII with line ends: one line, or two if result and people are of different frames.
 
-    result, people: as in Stream.write. age_s: time since the capture of the frame. most_bytes: a longer line is split
-    into parts, each with some of the targets and people, its number `part` from 1 and their count `parts`; 0: never.
-    A line of one target is never split. Numbers that are not finite are null.
+    result, people: as in Stream.write. age_s: time since the capture of the frame. most_bytes: limit of a
+    line, 0 for none. A longer line is split into parts. Each part has some of the targets and people, its number
+    `part`, from 1, and the count `parts`. A line of one target is never split. Numbers that are not finite are null.
     """
     apart = result is not None and people is not None and result.tracked.number != people.number
     lines = []

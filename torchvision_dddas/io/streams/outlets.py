@@ -67,7 +67,7 @@ class Outlet(ABC):
         """Reopen after trouble. Raise OSError if that fails, BlockingIOError while it is not decided."""
 
     def handle(self) -> int | None:
-        """Return a new descriptor of the file to sync, which the caller closes; None without a file."""
+        """Return a new file descriptor for a sync, which the caller closes. Return None if there is no file."""
         return None
 
     @abstractmethod

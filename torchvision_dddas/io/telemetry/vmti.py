@@ -10,7 +10,7 @@ VMTI = 74
 """The item of MISB ST 0601 for the set."""
 
 _VERSION = 5  # ST 0903.5
-_MOST = 500  # targets in a set; the set tells how many there are beyond
+_MOST = 500  # targets in a set; the set also states the number of all targets
 _LARGEST_ID = 2_097_151
 _OFFSET = -19.2, 19.2, 3  # range in degrees, and bytes
 
@@ -57,7 +57,7 @@ def encode_vmti(
 
 
 def _pack(target: VmtiTarget, size_px: tuple[int, int], centre_deg: tuple[float, float]) -> bytes:
-    """Return a VTarget pack: the identity, and items; no bytes if the target cannot be told."""
+    """Return a VTarget pack: the identity, and items; no bytes if the set cannot hold the target."""
     width, height = size_px
     if not all(map(math.isfinite, target.box_px)):
         return b""

@@ -26,7 +26,7 @@ from torchvision_dddas.lab.simulation.served_vehicle import (
 from torchvision_dddas.types import Command, Order
 
 FIRST_SYSTEM = 11
-"""Number of the first ground vehicle; the others follow."""
+"""MAVLink system of the first ground vehicle. The others have the next numbers."""
 
 # A rover with an autopilot of no known firmware, armed and in guided mode, active; version 3 of the protocol.
 _HEARTBEAT = (10, 0, 0x80 | 0x08, 0, 4, 3)
