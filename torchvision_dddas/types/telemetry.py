@@ -148,6 +148,9 @@ def ground_distance(altitude_m: float, below_horizon_rad: ArrayLike) -> np.ndarr
     """Return the distances, m, to level ground along lines of sight at angles (...) below the horizon.
 
     An angle of less than about 6 degrees counts as 6 degrees, because its ground is too far to tell.
+
+    >>> types.ground_distance(50.0, np.radians([90, 30])).round(6).tolist()
+    [50.0, 100.0]
     """
     return altitude_m / np.maximum(np.sin(below_horizon_rad), _LEAST_SINE)
 
