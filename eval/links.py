@@ -41,7 +41,7 @@ FROM_S, SETTLED_S = 8.0, 3.0
 PATIENCE_S, POLL_S = 60.0, 0.1
 LINKS, PROCESS, PLANNED = "over links", "in process", "in process, not steered"
 INSTRUMENTS, VERBS = ("camera", "gps", "attitude"), ("off", "stuck", "wrong", "slow")
-FAULT_S, APART_S = 5.0, 13.0  # duration of a fault, and from one fault to the next
+FAULT_S, APART_S = 5.0, 20.0  # duration of a fault, and from one fault to the next
 Case = dict[str, Any]
 Rows = list[tuple[float, np.ndarray]]
 """Times of the world, and places (N, 2) in longitude and latitude."""

@@ -15,6 +15,7 @@ import pytest
 from tests.live.streams import PATIENCE_S, FakeClock, FakeStream, Streams
 from tests.live.test_log_alignment import Camera, feed_of
 from torchvision_dddas.config import AerialParameters, LiveParameters
+from torchvision_dddas.geo.turn_agreement import Contradiction
 from torchvision_dddas.io.telemetry import ReportWindow
 from torchvision_dddas.live import live_telemetry
 from torchvision_dddas.live.capture import LiveSource
@@ -177,6 +178,25 @@ def test_a_sure_estimate_of_the_clock_offset_is_used_and_reported(live, monkeypa
     list(feed)
     flight = None if feed.log is None else feed.log.at(1.42)
     assert flight is not None and flight.altitude_m == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_contradiction_of_reports_and_pictures_is_a_trouble_while_it_lasts(live, monkeypatch):
+    made, _, health = live
+    found: list[Contradiction] = []
+    monkeypatch.setattr(live_telemetry, "find_contradictions", lambda *_: found)
+    locator: Any = None
+    motions = [(k / 10, np.eye(3)) for k in range(300)]
+    made.find_contradiction(locator, [])
+    made.find_contradiction(locator, motions)
+    assert texts(health) == [] and health.snapshot().troubles == ()
+    found.append(Contradiction(25.0, 29.5, 3.0, 0.0, 120.0))
+    for _ in range(2):
+        made.find_contradiction(locator, motions)
+    (trouble,) = health.snapshot().troubles
+    assert "by 0 degrees in the pictures, and by 120 in the telemetry" in trouble
+    made.find_contradiction(locator, [*motions, (33.0, np.eye(3))])
+    assert health.snapshot().troubles == ()
+    assert texts(health) == [trouble, "telemetry and pictures agree again"]
 
 
 def test_results_have_the_times_of_exposure_by_the_stamps_of_klv_unless_its_clock_is_wrong(live):

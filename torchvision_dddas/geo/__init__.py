@@ -40,6 +40,7 @@ from torchvision_dddas.geo.site import (
     resolve_camera,
     to_local,
 )
+from torchvision_dddas.geo.turn_agreement import describe_contradictions, find_contradictions
 from torchvision_dddas.geo.zones import Zones
 
 __all__ = [
@@ -66,11 +67,13 @@ __all__ = [
     "complete_site",
     "complete_telemetry",
     "describe_clock_offset",
+    "describe_contradictions",
     "describe_heading_offset",
     "describe_no_place",
     "describe_unknown_heights",
     "draw_calibration",
     "estimate_flight_errors",
+    "find_contradictions",
     "find_heading_offset",
     "find_looks",
     "frames_to_locate",

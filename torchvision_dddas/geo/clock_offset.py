@@ -12,7 +12,7 @@ import numpy as np
 
 from torchvision_dddas.geo.aerial_locator import AerialLocator
 from torchvision_dddas.geometry import axes_of
-from torchvision_dddas.types import Elevation, Float, Telemetry
+from torchvision_dddas.types import Camera, Elevation, Float, Telemetry
 
 # Offsets tried first: their range and step; how many of the best are refined; and the Gauss-Newton steps for each.
 _REACH_S, _STEP_S, _BEST, _REFINEMENTS = 30.0, 0.1, 6, 5
@@ -53,15 +53,22 @@ def measure_clock_offset(
     # A heading from the course, or from the nose of a vehicle with a gimbal, does not turn with the camera.
     if telemetry is None or telemetry.heading_from or len(seen) < _LEAST:
         return None
-    (fu, fv), (u, v) = camera.focal_px, camera.centre_px
-    pixel_from_ray = np.array([[fu, 0, u], [0, fv, v], [0, 0, 1]])
-    time_s, motion = np.array([time for time, _ in seen]), np.array([motion for _, motion in seen])
-    turned = _angles(np.linalg.inv(pixel_from_ray) @ motion @ pixel_from_ray)
+    time_s, turned = np.array([time for time, _ in seen]), seen_turns(camera, seen)
     found = find_clock_offset(time_s, turned, telemetry.time_s, logged_turns(telemetry, locator.site.elevation))
     # The time of a picture is known only to within half a frame interval.
     if found is None or abs(found[0]) <= max(3 * found[1], float(np.median(np.diff(time_s))) / 2):
         return None
     return found[0], max(found[1], 0.001)
+
+
+def seen_turns(camera: Camera, seen: Sequence[tuple[float, np.ndarray]]) -> Float[np.ndarray, "N 3"]:
+    """Return the apparent turn of the ground between two pictures, in the axes of `logged_turns`.
+
+    seen: as in `describe_clock_offset`.
+    """
+    (fu, fv), (u, v) = camera.focal_px, camera.centre_px
+    pixel_from_ray = np.array([[fu, 0, u], [0, fv, v], [0, 0, 1]])
+    return _angles(np.linalg.inv(pixel_from_ray) @ np.array([motion for _, motion in seen]) @ pixel_from_ray)
 
 
 def logged_turns(telemetry: Telemetry, elevation: Elevation | None = None) -> Float[np.ndarray, "N 3"]:
@@ -86,7 +93,7 @@ def _angles(now_from_before: np.ndarray) -> np.ndarray:
     return np.stack([h[:, 1, 2], -h[:, 0, 2], (h[:, 0, 1] - h[:, 1, 0]) / 2], axis=1)
 
 
-class _Turn:
+class Turn:
     """A turn as a function of time: smoothed, and linear between samples."""
 
     def __init__(self, time_s: np.ndarray, steps: np.ndarray, step_s: float, every: int = 1) -> None:
@@ -121,7 +128,7 @@ def find_clock_offset(
         return None
     every = max(round(_STEP_S / sample_s), 1)
     step_s = every * sample_s
-    clip, log = _Turn(time_s, turned_rad, frame_s), _Turn(log_s, logged_rad, sample_s, every)
+    clip, log = Turn(time_s, turned_rad, frame_s), Turn(log_s, logged_rad, sample_s, every)
     near = log.time_s[(log.time_s > time_s[0] - _REACH_S) & (log.time_s < time_s[-1] + _REACH_S)]
     ahead = max(round(_SPAN_S / step_s), 1)
     begin, end = near[:-ahead], near[ahead:]

@@ -12,7 +12,13 @@ import numpy as np
 
 from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import AerialLocator, has_places, measure_clock_offset, predict_flight
+from torchvision_dddas.geo import (
+    AerialLocator,
+    find_contradictions,
+    has_places,
+    measure_clock_offset,
+    predict_flight,
+)
 from torchvision_dddas.io.output import without_numbers
 from torchvision_dddas.io.sources import names_file
 from torchvision_dddas.io.telemetry import ReportWindow
@@ -31,6 +37,9 @@ _WRONG_CLOCK_S, _SAME_DELAY_S = 5.0, 0.05
 _WAIT_S, _SETTLING_S = 10.0, 1.0  # for the first report, and for those of other kinds after it
 # A clock offset is estimated so often; a less certain or larger estimate is not used.
 _MEASURE_S, _SURE_S, _MOST_OFFSET_S = 10.0, 0.1, 10.0
+# Reports and pictures of the last _COMPARED_S are compared every _COMPARE_S, and a contradiction holds for
+# _CONTRADICTED_S.
+_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 16.0, 3.0
 _MOST_EVENTS = 50
 _FIRST_BYTES = 1 << 16
 
@@ -63,8 +72,8 @@ class LiveTelemetry:
 
     raw: the newest reports as they were read; None before the first. log: the flight of the latest minute and a half,
     completed and continued beyond the newest report. measure: called now and then in the thread, to estimate the clock
-    offset. clock_offset_s: as in `align_log`. delay_s: from the exposure of pictures, by the stamps of their KLV, to
-    their reception; 0 if unknown.
+    offset. compare: called every second in the thread, to compare reports and pictures. clock_offset_s: as in
+    `align_log`. delay_s: from the exposure of pictures, by the stamps of their KLV, to their reception; 0 if unknown.
     """
 
     def __init__(
@@ -81,11 +90,12 @@ class LiveTelemetry:
         self.log: Telemetry | None = None
         self.clock_offset_s = self.delay_s = 0.0
         self.measure: Callable[[], object] = lambda: None
+        self.compare: Callable[[], object] = lambda: None
         self._source, self._window, self._health = source, window, health
         self._complete: Complete | None = None
         self._flown: Telemetry | None = None  # the completed flight
         self._first: Telemetry | None = None  # the first report with a place, whose height may be that of the take-off
-        self._told, self._has_wrong_clock = set[str](), False
+        self._told, self._has_wrong_clock, self._is_contradicted = set[str](), False, False
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
@@ -134,6 +144,19 @@ class LiveTelemetry:
         offset = f"aerial.clock_offset_s={self.clock_offset_s:.3f} is used from now on"
         self._health.event("telemetry", f"{turns}: {offset}")
 
+    def find_contradiction(self, locator: AerialLocator, motions: Sequence[tuple[float, np.ndarray]]) -> None:
+        """Report a trouble while the newest reports and pictures contradict each other."""
+        if not motions:
+            return
+        recent = [motion for motion in motions if motion[0] > motions[-1][0] - _COMPARED_S]
+        found = find_contradictions(locator, recent)
+        is_now = bool(found) and found[-1].end_s > recent[-1][0] - _CONTRADICTED_S
+        words = f"telemetry and pictures contradict each other: {found[-1].describe()}" if is_now else ""
+        if is_now != self._is_contradicted:
+            self._is_contradicted = is_now
+            self._health.event("telemetry", words or "telemetry and pictures agree again")
+        self._health.trouble("contradiction", words)
+
     def describe_silence(self, utc_s: float) -> str:
         """Return how old the newest report is at a time; "" if there is none, or by a wrong clock."""
         if self.raw is None or self._has_wrong_clock:
@@ -148,7 +171,7 @@ class LiveTelemetry:
         self._window.close()
 
     def _run(self) -> None:
-        refreshed_s = measured_s = time.monotonic()
+        refreshed_s = measured_s = compared_s = time.monotonic()
         is_new, complete = False, self._complete
         while not self._closing.is_set():
             try:
@@ -168,6 +191,9 @@ class LiveTelemetry:
                 if now_s > measured_s + _MEASURE_S:
                     measured_s = now_s
                     self.measure()
+                if now_s > compared_s + _COMPARE_S:
+                    compared_s = now_s
+                    self.compare()
             except InputError as error:
                 self.tell(str(error))
             except Exception as error:  # no fault of a report ends the run

@@ -96,12 +96,16 @@ class RunInputs:
             feed.place_landmarks = lambda: marks.place(feed.locator, feed.exposed_utc_s, self.source.rate_hz)
 
     def _follow(self, feed: Feed, notes: Sequence[str], pipeline: Pipeline) -> None:
-        """Complete live reports for the site of the locator; estimate the clock offset, unless it is given or known."""
+        """Complete live reports for the site of the locator, and compare them with the pictures.
+
+        Estimate the clock offset, unless it is given or known.
+        """
         reports = self.reports
         assert reports is not None
         if (locator := feed.locator) is None:
             reports.begin(lambda log: (log, []), notes)
             return
         reports.begin(completion(self.given, self._settings, locator), notes)
+        reports.compare = lambda: reports.find_contradiction(locator, pipeline.motions)
         if not is_set(self._settings, "aerial.clock_offset_s") and reports.name != KLV:
             reports.measure = lambda: reports.estimate_clock_offset(locator, pipeline.motions)

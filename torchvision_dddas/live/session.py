@@ -32,6 +32,7 @@ from torchvision_dddas.io.video_packets import check_encoder
 from torchvision_dddas.live.access import choose_access
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.commanding import CommandOptions, LiveCommands, open_commands
+from torchvision_dddas.live.frozen_camera import FrozenCamera
 from torchvision_dddas.live.health import Health, StatusWriter
 from torchvision_dddas.live.line_socket import LineSocket
 from torchvision_dddas.live.operator_view import OperatorView
@@ -134,7 +135,7 @@ class _Session:
             self.health.count(name, 0)
         self.watchdog = Watchdog(self.health, self.live.watchdog_s, self.supervisor)
         self.name = without_secrets(options.clip)
-        self.failure, self.tally = "", _Located()
+        self.failure, self.tally, self.frozen = "", _Located(), FrozenCamera()
 
     # -- the start: find possible faults before the session has a folder ----------------------------------------------
 
@@ -410,6 +411,8 @@ class _Session:
             self.facts |= deepcopy({"zones": self.counts.rows, "crowd_events": self.counts.crowds})
             for event in events:
                 self.health.event("zone" if event.zone else "crowd", event.describe(), event.frame)
+        self.frozen.add(located)
+        self.health.trouble("frozen", self.frozen.describe())
         if cause := self.tally.add(located):
             self.health.event("locate", f"not located: {cause}", located.number)
         return located

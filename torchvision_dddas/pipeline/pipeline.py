@@ -24,6 +24,7 @@ from torchvision_dddas.geo import (
     LandmarkWatch,
     WatchedScene,
     describe_clock_offset,
+    describe_contradictions,
     describe_heading_offset,
     describe_no_place,
     group_crowds,
@@ -311,7 +312,7 @@ class Pipeline:
         if self._crowds is not None:  # the tracker held no frame back, so open events become notes
             self.notes += [f"at the end of the clip: {event.describe()}" for event in self._crowds[1].flush()]
         if self._watch is not None:
-            for describe in (describe_clock_offset, describe_heading_offset):
+            for describe in (describe_clock_offset, describe_heading_offset, describe_contradictions):
                 if note := describe(self._watch.locator, self._motions):
                     self.notes.append(note)
         if self._team is not None:
