@@ -74,14 +74,17 @@ def find_contradictions(locator: AerialLocator, seen: Sequence[tuple[float, np.n
     end_s = np.arange(time_s[0], time_s[-1] + _STEP_S / 2, _STEP_S)
     allowed = _ALLOWED_RAD + _position_noise(telemetry, locator.settings.aerial.position_sigma_m, end_s)
     shifts = np.arange(-_SHIFT_S, _SHIFT_S + _STEP_S / 2, _STEP_S)
-    excess, turns = [], []
+    excess, turns, found_s = [], [], np.zeros(0)
     for span_s in _SPANS_S:
         in_clip = clip.between(end_s - span_s, end_s)
         in_log = np.stack([log.between(end_s - span_s + shift, end_s + shift) for shift in shifts])
         larger = np.maximum(np.abs(in_clip), np.abs(in_log))
         over = np.abs(in_clip - in_log) - allowed - _SHARE * larger
-        # An unknown turn contradicts nothing.
-        excess.append(np.where(np.isnan(over).any(axis=0), -np.inf, over.min(axis=0)))
+        # An unknown turn contradicts nothing. A leap that a shorter span shows is over when that span is over.
+        had = np.array([((found_s > end - span_s - _SHIFT_S) & (found_s <= end)).any() for end in end_s])
+        unknown = np.isnan(over).any(axis=0) | had[:, None]
+        excess.append(np.where(unknown, -np.inf, over.min(axis=0)))
+        found_s = np.r_[found_s, end_s[(excess[-1] > 0).any(axis=1)]]
         turns.append((in_clip, in_log[len(shifts) // 2]))
     found = []
     worst = np.max(excess, axis=(0, 2))

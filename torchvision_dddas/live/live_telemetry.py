@@ -39,7 +39,7 @@ _WAIT_S, _SETTLING_S = 10.0, 1.0  # for the first report, and for those of other
 _MEASURE_S, _SURE_S, _MOST_OFFSET_S = 10.0, 0.1, 10.0
 # Reports and pictures of the last _COMPARED_S are compared every _COMPARE_S, and a contradiction holds for
 # _CONTRADICTED_S.
-_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 16.0, 3.0
+_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 24.0, 2.0
 _MOST_EVENTS = 50
 _FIRST_BYTES = 1 << 16
 
