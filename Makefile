@@ -26,13 +26,13 @@ oldest:
 	VIRTUAL_ENV=.venv-oldest .venv-oldest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EXTRAS)]'
 	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
-# `make test` with each installed Python from 3.11 to 3.13, including those of pyenv, which are not on the path.
+# The quick tests with each installed Python from 3.11 to 3.13, including those of pyenv, which are not on the path.
 OTHERS ?= 3.11 3.12 3.13
 test-python:
 	@for version in $(OTHERS); do \
 		for python in "$$(command -v python$$version)" "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/$$version.*/bin/python; do \
 			if "$$python" -c '' 2> /dev/null; then \
-				$(MAKE) test PYTHON="$$python" VENV=.venv-$$version || exit; continue 2; \
+				$(MAKE) quick PYTHON="$$python" VENV=.venv-$$version || exit; continue 2; \
 			fi; \
 		done; \
 		echo "no Python $$version: its tests are left out" >&2; \
