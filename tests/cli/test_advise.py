@@ -71,6 +71,14 @@ def test_the_command_to_run_is_the_last_line(clip: Path, dddas) -> None:
     assert "unreliable: 1 of 5 frames; 1 because blank" in done.stdout
 
 
+def test_a_log_without_places_is_not_said_to_need_nothing(clip: Path, dddas, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("time_s,altitude_m,speed_m_s\n0,50,5\n9,50,5\n")
+    lines = dddas("advise", str(clip), "--telemetry", str(log)).output.splitlines()
+    assert any(line.startswith("note: 0 located, because") for line in lines)
+    assert any(line.startswith("nothing is located without the data named above") for line in lines)
+
+
 def test_a_simulated_clip_and_a_camera_without_a_log_are_refused(dddas) -> None:
     assert "dddas simulate" in bad(dddas("advise", "sim:four"))
     assert "--telemetry" in bad(dddas("advise", "clip.mp4", "--camera", "a.toml"))

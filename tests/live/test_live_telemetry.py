@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -184,19 +185,33 @@ def test_a_contradiction_of_reports_and_pictures_is_a_trouble_while_it_lasts(liv
     made, _, health = live
     found: list[Contradiction] = []
     monkeypatch.setattr(live_telemetry, "find_contradictions", lambda *_: found)
-    locator: Any = None
-    motions = [(k / 10, np.eye(3)) for k in range(300)]
+    site = SimpleNamespace(telemetry=Telemetry(np.arange(2.0), np.full(2, 50.0), np.zeros(2)))
+    locator: Any = SimpleNamespace(site=site)
+
+    def compare(until_s: float) -> None:
+        made.find_contradiction(locator, [(k / 10, np.eye(3)) for k in range(round(10 * until_s))])
+
     made.find_contradiction(locator, [])
-    made.find_contradiction(locator, motions)
+    compare(28.0)
     assert texts(health) == [] and health.snapshot().troubles == ()
     found.append(Contradiction(25.0, 29.5, 3.0, 0.0, 120.0))
-    for _ in range(2):
-        made.find_contradiction(locator, motions)
+    for until_s in (29.0, 30.0):
+        compare(until_s)
     (trouble,) = health.snapshot().troubles
-    assert "by 0 degrees in the pictures, and by 120 in the telemetry" in trouble
-    made.find_contradiction(locator, [*motions, (33.0, np.eye(3))])
+    assert "the log leaps" in trouble and "and by 105 m or turns by over 90 degrees in the log" in trouble
+    compare(33.0)
     assert health.snapshot().troubles == ()
     assert texts(health) == [trouble, "telemetry and pictures agree again"]
+    # Without a new picture nothing is known; nor is it when the leap is too long ago.
+    found[0] = found[0]._replace(end_s=40.0)
+    compare(40.0)
+    compare(40.0)
+    assert health.snapshot().troubles == ()
+    compare(41.0)
+    found.clear()
+    compare(42.0)
+    assert health.snapshot().troubles == () and len(texts(health)) == 4
+    assert texts(health)[-1] == "telemetry and pictures agree since the last leap, but places may still be wrong"
 
 
 def test_results_have_the_times_of_exposure_by_the_stamps_of_klv_unless_its_clock_is_wrong(live):

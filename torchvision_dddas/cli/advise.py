@@ -72,7 +72,10 @@ def advise(
     lines += [f"note: {note}" for note in [*notes, *remarks]]
     lines += [f"{option}: {reason}" for option, reason in options.items()]
     if not options:
-        lines.append(f"no option is needed{'' if live else ' for this file'}, judging by these frames and the log")
+        needed = "no option is needed"
+        if telemetry is not None and any(note.startswith(NONE_LOCATED) for note in notes):
+            needed = "nothing is located without the data named above; otherwise no option is needed"
+        lines.append(f"{needed}{'' if live else ' for this file'}, judging by these frames and the log")
     words = ["dddas", "run", clip]
     for name, value in {"--telemetry": telemetry, "--camera": camera, "--rate": rate}.items():
         words += [] if value is None else [name, f"{value:g}" if isinstance(value, float) else str(value)]

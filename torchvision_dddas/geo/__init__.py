@@ -40,7 +40,12 @@ from torchvision_dddas.geo.site import (
     resolve_camera,
     to_local,
 )
-from torchvision_dddas.geo.turn_agreement import describe_contradictions, find_contradictions
+from torchvision_dddas.geo.turn_agreement import (
+    Contradiction,
+    describe_contradictions,
+    find_contradictions,
+    flying_height,
+)
 from torchvision_dddas.geo.zones import Zones
 
 __all__ = [
@@ -49,6 +54,7 @@ __all__ = [
     "PART_OF_OFFSET",
     "AerialLocator",
     "CalibratedColours",
+    "Contradiction",
     "FlightErrors",
     "GroundLocator",
     "LandmarkWatch",
@@ -76,6 +82,7 @@ __all__ = [
     "find_contradictions",
     "find_heading_offset",
     "find_looks",
+    "flying_height",
     "frames_to_locate",
     "geoid_of",
     "group_crowds",

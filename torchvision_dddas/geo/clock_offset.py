@@ -53,7 +53,7 @@ def measure_clock_offset(
     # A heading from the course, or from the nose of a vehicle with a gimbal, does not turn with the camera.
     if telemetry is None or telemetry.heading_from or len(seen) < _LEAST:
         return None
-    time_s, turned = np.array([time for time, _ in seen]), seen_turns(camera, seen)
+    time_s, turned = np.array([time for time, _ in seen]), seen_turns(camera, [motion for _, motion in seen])
     found = find_clock_offset(time_s, turned, telemetry.time_s, logged_turns(telemetry, locator.site.elevation))
     # The time of a picture is known only to within half a frame interval.
     if found is None or abs(found[0]) <= max(3 * found[1], float(np.median(np.diff(time_s))) / 2):
@@ -61,14 +61,14 @@ def measure_clock_offset(
     return found[0], max(found[1], 0.001)
 
 
-def seen_turns(camera: Camera, seen: Sequence[tuple[float, np.ndarray]]) -> Float[np.ndarray, "N 3"]:
+def seen_turns(camera: Camera, motions: Sequence[np.ndarray]) -> Float[np.ndarray, "N 3"]:
     """Return the apparent turn of the ground between two pictures, in the axes of `logged_turns`.
 
-    seen: as in `describe_clock_offset`.
+    motions: (3, 3) pixel homographies from the frame before, NaN if unknown.
     """
     (fu, fv), (u, v) = camera.focal_px, camera.centre_px
     pixel_from_ray = np.array([[fu, 0, u], [0, fv, v], [0, 0, 1]])
-    return _angles(np.linalg.inv(pixel_from_ray) @ np.array([motion for _, motion in seen]) @ pixel_from_ray)
+    return _angles(np.linalg.inv(pixel_from_ray) @ np.array(motions) @ pixel_from_ray)
 
 
 def logged_turns(telemetry: Telemetry, elevation: Elevation | None = None) -> Float[np.ndarray, "N 3"]:

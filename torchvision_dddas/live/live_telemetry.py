@@ -14,7 +14,9 @@ from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
     AerialLocator,
+    Contradiction,
     find_contradictions,
+    flying_height,
     has_places,
     measure_clock_offset,
     predict_flight,
@@ -39,7 +41,7 @@ _WAIT_S, _SETTLING_S = 10.0, 1.0  # for the first report, and for those of other
 _MEASURE_S, _SURE_S, _MOST_OFFSET_S = 10.0, 0.1, 10.0
 # Reports and pictures of the last _COMPARED_S are compared every _COMPARE_S, and a contradiction holds for
 # _CONTRADICTED_S.
-_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 24.0, 2.0
+_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 75.0, 2.0
 _MOST_EVENTS = 50
 _FIRST_BYTES = 1 << 16
 
@@ -95,7 +97,9 @@ class LiveTelemetry:
         self._complete: Complete | None = None
         self._flown: Telemetry | None = None  # the completed flight
         self._first: Telemetry | None = None  # the first report with a place, whose height may be that of the take-off
-        self._told, self._has_wrong_clock, self._is_contradicted = set[str](), False, False
+        self._told, self._has_wrong_clock = set[str](), False
+        self._contradiction: Contradiction | None = None  # the current one
+        self._compared_s = -math.inf  # time of the newest picture that was compared
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
@@ -146,15 +150,21 @@ class LiveTelemetry:
 
     def find_contradiction(self, locator: AerialLocator, motions: Sequence[tuple[float, np.ndarray]]) -> None:
         """Report a trouble while the newest reports and pictures contradict each other."""
-        if not motions:
+        newest_s, before_s = motions[-1][0] if motions else -math.inf, self._compared_s
+        self._compared_s = newest_s
+        if not newest_s > before_s:  # without a new picture nothing is known
+            self._health.trouble("contradiction")
             return
-        recent = [motion for motion in motions if motion[0] > motions[-1][0] - _COMPARED_S]
-        found = find_contradictions(locator, recent)
-        is_now = bool(found) and found[-1].end_s > recent[-1][0] - _CONTRADICTED_S
-        words = f"telemetry and pictures contradict each other: {found[-1].describe()}" if is_now else ""
-        if is_now != self._is_contradicted:
-            self._is_contradicted = is_now
-            self._health.event("telemetry", words or "telemetry and pictures agree again")
+        found = find_contradictions(locator, [motion for motion in motions if motion[0] > newest_s - _COMPARED_S])[-1:]
+        now = found[0] if found and found[0].end_s > newest_s - _CONTRADICTED_S else None
+        words = ""
+        if now is not None:
+            words = f"telemetry and pictures contradict each other: {now.describe(flying_height(locator))}"
+        if (now is None) != (self._contradiction is None):
+            leapt = self._contradiction is not None and self._contradiction.leaps and not found
+            ended = "since the last leap, but places may still be wrong" if leapt else "again"
+            self._health.event("telemetry", words or f"telemetry and pictures agree {ended}")
+        self._contradiction = now
         self._health.trouble("contradiction", words)
 
     def describe_silence(self, utc_s: float) -> str:

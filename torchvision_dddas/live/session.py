@@ -387,7 +387,8 @@ class _Session:
                     is_settled = not located.tracks.provisional
                     located = self._add_events(located) if is_settled else located
                     start_utc_s = self.feed.exposed_utc_s if isnan(recorded_utc_s) else recorded_utc_s
-                    newest = self.feed.newest
+                    # The last results come after the end of the stream was noticed: this is no latency.
+                    newest = None if self.feed.ended else self.feed.newest
                     writer.put((located, people), start_utc_s, nan if newest is None else newest.taken_s)
                     self.lines.write(located, people, start_utc_s)
                     if self.server is not None and is_settled:
