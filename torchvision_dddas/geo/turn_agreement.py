@@ -187,7 +187,9 @@ class _BothTurns:
         ones = np.ones_like(level)
         share = np.column_stack([ones, ones, level])
         shift = (sigma_m / np.maximum(np.nan_to_num(log.altitude_m), 1.0))[:, None] * share
-        angle = np.nan_to_num(np.fmax(log.heading_sigma_rad, log.tilt_sigma_rad))[:, None]
+        # An error that stays the same turns nothing; that of predicted rows grows.
+        sigma_rad = np.nan_to_num(np.fmax(log.heading_sigma_rad, log.tilt_sigma_rad))
+        angle = np.maximum(sigma_rad - np.median(sigma_rad), 0.0)[:, None]
         self._time_s, self._noise = log.time_s, _SIGMAS * (shift + angle)
 
     def compare(self, begin_s: np.ndarray, end_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -40,8 +40,8 @@ _WAIT_S, _SETTLING_S = 10.0, 1.0  # for the first report, and for those of other
 # A clock offset is estimated so often; a less certain or larger estimate is not used.
 _MEASURE_S, _SURE_S, _MOST_OFFSET_S = 10.0, 0.1, 10.0
 # Reports and pictures of the last _COMPARED_S are compared every _COMPARE_S, and a contradiction holds for
-# _CONTRADICTED_S.
-_COMPARE_S, _COMPARED_S, _CONTRADICTED_S = 1.0, 75.0, 2.0
+# _CONTRADICTED_S. Pictures of the last _UNSURE_S before the newest report wait, because a clock offset is allowed.
+_COMPARE_S, _COMPARED_S, _CONTRADICTED_S, _UNSURE_S = 1.0, 75.0, 2.0, 1.0
 _MOST_EVENTS = 50
 _FIRST_BYTES = 1 << 16
 
@@ -150,6 +150,9 @@ class LiveTelemetry:
 
     def find_contradiction(self, locator: AerialLocator, motions: Sequence[tuple[float, np.ndarray]]) -> None:
         """Report a trouble while the newest reports and pictures contradict each other."""
+        # The flight beyond the newest report is a guess.
+        until_s = self._reported_until_s(locator) - _UNSURE_S
+        motions = [motion for motion in motions if motion[0] <= until_s]
         newest_s, before_s = motions[-1][0] if motions else -math.inf, self._compared_s
         self._compared_s = newest_s
         if not newest_s > before_s:  # without a new picture nothing is known
@@ -166,6 +169,13 @@ class LiveTelemetry:
             self._health.event("telemetry", words or f"telemetry and pictures agree {ended}")
         self._contradiction = now
         self._health.trouble("contradiction", words)
+
+    def _reported_until_s(self, locator: AerialLocator) -> float:
+        """Return the time of the newest report by the clock of the pictures, s; infinite if nothing is predicted."""
+        telemetry, log, raw = locator.site.telemetry, self.log, self.raw
+        if telemetry is None or log is None or raw is None:
+            return math.inf
+        return float(telemetry.time_s[-1] - (log.time_s[-1] - raw.time_s[-1]))
 
     def describe_silence(self, utc_s: float) -> str:
         """Return how old the newest report is at a time; "" if there is none, or by a wrong clock."""
