@@ -19,8 +19,9 @@ from torchvision_dddas.types import Telemetry
 # Turns are compared over each of _SPANS_S, every _STEP_S, for clock offsets up to _SHIFT_S. Differences count if they
 # last for _LEAST_S at least.
 _SPANS_S, _STEP_S, _SHIFT_S, _LEAST_S = (3.0, 6.0, 12.0), 0.25, 1.0, 0.5
-# After a leap, log and pictures are compared with those before the leap for so long.
-_LEAP_S = 60.0
+# After a leap, log and pictures are compared with those before the leap for so long. The sum of large turns is not
+# exact: a leap is undone if less than this share of it is left beyond what is allowed.
+_LEAP_S, _UNDONE = 60.0, 0.2
 # The allowed difference: a constant, so many standard deviations of a position, and a share of the larger turn.
 _ALLOWED_RAD, _SIGMAS, _SHARE = 0.06, 4.0, 0.4
 # A mended clock must leave this share of the spans to compare; the leap itself may look like a wrong clock.
@@ -142,7 +143,8 @@ def _follow(leap: Contradiction, both: "_BothTurns", end_s: np.ndarray) -> Contr
     at_s = leap.begin_s + leap.span_s - _SHIFT_S
     later_s = end_s[(end_s > leap.end_s) & (end_s <= at_s + _LEAP_S)]
     before_s = np.full(len(later_s), at_s - _SHIFT_S - _STEP_S)
-    undone_s = later_s[~(both.compare(before_s, later_s)[0] > 0).any(axis=1)]
+    least = _UNDONE * np.radians(leap.logged_deg)
+    undone_s = later_s[~(both.compare(before_s, later_s)[0] > least).any(axis=1)]
     # A clock offset shows that the leap is undone up to _SHIFT_S before that.
     last_s = undone_s[0] + _SHIFT_S if len(undone_s) else max([leap.end_s, *later_s])
     return leap._replace(begin_s=at_s, end_s=min(float(last_s), float(end_s[-1])))
