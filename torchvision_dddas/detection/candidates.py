@@ -219,7 +219,10 @@ def _sum_boxes(table: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _first_of_alike(box: np.ndarray, always: int) -> np.ndarray:
-    """Return (N,) bool: whether a box differs from all kept boxes before it. The first `always` boxes are kept."""
+    """Return (N,) bool, whether each box is kept: it differs from all kept boxes before it, or is one of the first.
+
+    always: number of the first boxes that are kept anyway.
+    """
     first = np.ones(len(box), bool)
     alike = overlaps(box, box) > _ALIKE
     for i in range(len(box)):

@@ -29,7 +29,7 @@ TINY: dict[str, object] = {
     "morphology.erode_px": 1,
     # People who walk together become one target.
     "morphology.close_m": 1.5,
-    # A crowd does not move as one body, so an outline refined by motion would lose most of it.
+    # The people of a crowd do not move as one body, so an outline refined by motion would lose most of it.
     "refine.on": False,
 }
 """Detection parameters for pictures in which people are smaller than `gates.tiny_px`."""

@@ -37,8 +37,8 @@ class Contradiction(NamedTuple):
     """A time in which log and pictures disagree, s, and both motions of the view over span_s.
 
     The motions are angles by which the ground turns or shifts in the view, degrees: a shift by the flying height is 57
-    degrees. A log that leaps differs from before from begin_s, the time of the leap, to end_s. Another log moves too
-    little from begin_s to end_s.
+    degrees. If the log leaps, begin_s is the time of the leap, and until end_s the log differs from before the leap.
+    Otherwise the log moves too little or too much from begin_s to end_s.
     """
 
     begin_s: float
@@ -61,7 +61,7 @@ class Contradiction(NamedTuple):
         what = "the log leaps, so places before or after the leap are wrong"
         if not self.leaps:
             what = f"the log moves {'more' if self.logged_deg > self.seen_deg else 'less'} than the pictures: "
-            what += "a sensor is stuck or wrong, or the height above the ground is"
+            what += "a sensor is stuck or wrong, or the height above the ground is wrong"
         return f"{what} (within {self.span_s:g} s the ground shifts {seen} in the pictures, and {logged} in the log)"
 
 
@@ -128,7 +128,7 @@ def _find(
                 turns = abs(float(np.degrees(in_clip[row, axis]))), abs(float(np.degrees(in_log[row, axis])))
                 one = Contradiction(float(free_s[run[0]]) - span_s, float(free_s[run[-1]]), span_s, *turns)
                 found.append(_follow(one, both, end_s) if one.leaps else one)
-    return _merged(found), compared
+    return _merge(found), compared
 
 
 def _zooms(telemetry: Telemetry) -> bool:
@@ -138,7 +138,7 @@ def _zooms(telemetry: Telemetry) -> bool:
 
 
 def _follow(leap: Contradiction, both: "_BothTurns", end_s: np.ndarray) -> Contradiction:
-    """Return a leap with its own time as the begin, and as the end the time until which it is not undone."""
+    """Return a leap that begins at its own time and ends when it is undone, after _LEAP_S or with the clip."""
     # All clock offsets see the leap only _SHIFT_S after it.
     at_s = leap.begin_s + leap.span_s - _SHIFT_S
     later_s = end_s[(end_s > leap.end_s) & (end_s <= at_s + _LEAP_S)]
@@ -150,7 +150,7 @@ def _follow(leap: Contradiction, both: "_BothTurns", end_s: np.ndarray) -> Contr
     return leap._replace(begin_s=at_s, end_s=min(float(last_s), float(end_s[-1])))
 
 
-def _merged(found: Sequence[Contradiction]) -> list[Contradiction]:
+def _merge(found: Sequence[Contradiction]) -> list[Contradiction]:
     """Return contradictions in order, without those that begin in an earlier one, such as the leap back."""
     kept: list[Contradiction] = []
     for one in sorted(found):

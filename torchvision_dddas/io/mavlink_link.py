@@ -350,7 +350,7 @@ def _end(content: bytearray, place: int) -> int | None:
 def _build_decoder(dialect: Any, key: bytes) -> Any:
     class Decoder(dialect.MAVLink):
         def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-            # pymavlink notes a message's time before it compares the signature. A forged time would lock out a sender.
+            # pymavlink stores a message's time before it compares the signature: a forged time would lock a sender out.
             digest = hashlib.sha256(key + msgbuf[:-6]).digest()[:6]
             return digest == bytes(msgbuf[-6:]) and super().check_signature(msgbuf, srcSystem, srcComponent)
 

@@ -180,7 +180,7 @@ class TransportStream:
 
 
 def _stamped(stream: Any, packet: VideoPacket, begin: int = 0) -> Any:
-    """Return a packet of PyAV for a stream. begin: the stream's zero, in 1/HZ s."""
+    """Return a packet as PyAV writes it into a stream. begin: the time that becomes 0, in units of 1/HZ s."""
     import av
 
     made = av.Packet(packet.content)

@@ -4,6 +4,7 @@ from collections import deque
 
 import numpy as np
 
+from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import FrameResult
 
 # A frozen picture that is encoded again shifts by less than _STILL_PX. So does the picture of a camera that stands
@@ -50,6 +51,5 @@ def _shift_px(result: FrameResult) -> float:
     if motion is None or result.frame is None:
         return float(np.inf)
     height, width = result.frame.image.shape[:2]
-    corners = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]])
-    moved = motion @ corners
-    return float(np.abs(moved[:2] / moved[2] - corners[:2]).max())
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    return float(np.abs(transfer(motion, corners) - corners).max())

@@ -19,7 +19,7 @@ _LAST_S = 2.0  # time for the last lines at the end of a run
 
 
 class LineSocket:
-    """Gives each client the lines of all results from now on.
+    """Sends each client the lines of all results that come after its connection.
 
     The run calls `write` and `close`, and the server calls `serve` in a thread for each client.
     """

@@ -93,7 +93,7 @@ class OperatorView:
             self._images[frame.number] = frame.image
 
     def show(self, result: FrameResult, people: TrackedFrame | None) -> None:
-        """Make a result the newest one."""
+        """Show a result as the newest one."""
         self._recent.append(result)
         image = self._images.get(result.number)
         if self._images:

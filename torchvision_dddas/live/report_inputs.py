@@ -47,7 +47,7 @@ class ReportInput(Protocol):
 
 
 def is_live_input(text: str) -> bool:
-    """Return whether telemetry comes live by its name: an address, `-`, `klv`, a FIFO or a device, but no file."""
+    """Return whether a name stands for a live input: an address, `-`, `klv`, a FIFO or a device, but not a file."""
     if names_file(text):
         return not (Path(text).is_file() or Path(text).is_dir())
     return text in ("-", KLV) or is_mavlink(text) or re.match(r"(udp|nmea|gpsd|cot):", text) is not None

@@ -32,7 +32,7 @@ Page = Callable[[], tuple[int, str, Body]]
 """Returns (status, type, body); called in a server thread."""
 
 _CLIENT_TIMEOUT_S = 5.0
-_MOST_CLIENTS = 8  # simultaneous clients; a further one disconnects the oldest, so that slow clients cannot block it
+_MOST_CLIENTS = 8  # clients served at once; one more disconnects the oldest, so that slow clients cannot block the page
 _SHOWN_EVENTS = 20
 _ALARMS = ("zone", "crowd")  # kinds of events that an operator must not miss
 # Allow own files alone, and no code inside a page, so that a stream's name cannot become code.

@@ -309,7 +309,7 @@ class Pipeline:
             if not waiting and self._crowds is not None:  # the last frame gets the open events
                 result = replace(result, events=(*result.events, *self._in_degrees(self._crowds[1].flush())))
             yield result
-        if self._crowds is not None:  # the tracker held no frame back, so open events become notes
+        if self._crowds is not None:  # no result is left that could hold the open events, so they become notes
             self.notes += [f"at the end of the clip: {event.describe()}" for event in self._crowds[1].flush()]
         if self._watch is not None:
             for describe in (describe_clock_offset, describe_heading_offset, describe_contradictions):

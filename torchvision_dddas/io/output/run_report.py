@@ -91,7 +91,7 @@ def describe_state(complete: bool) -> str:
 
 
 def format_span(first: int, last: int) -> str:
-    """Return a span of frames as text, such as `3 to 7`."""
+    """Return the text of a range of frame numbers, such as `3 to 7`."""
     return f"{first}" if first == last else f"{first} to {last}"
 
 

@@ -333,7 +333,7 @@ class CotEvents:
         return event_uid(source, self._begun_utc_s or 0.0, target)
 
     def _own_events(self, located: AerialLocations, when: tuple[str, str]) -> list[bytes]:
-        """Return the event of the camera, at most one per second; none if its pose is unknown."""
+        """Return the camera's own event, at most once per second; no event if its pose is unknown."""
         fix, camera, origin, now_s = located.fix, self._about.camera, located.positions.origin_deg, located.time_s
         before_s, before_m = self._own
         lapse_s = now_s - before_s

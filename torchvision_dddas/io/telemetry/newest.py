@@ -129,7 +129,7 @@ class ReportWindow:
             if self._odd < _SET_AFTER:
                 apart = f"{ahead_s:g} s ahead of" if ahead_s > 0 else f"{-ahead_s:g} s behind"
                 return f"the time_s of a row is {apart} the others: such rows are left out"
-            self._reports.clear()  # the sender's clock was set
+            self._reports.clear()  # the sender has set its clock
             newest_s = math.nan
         if math.isfinite(time_s):
             self._odd, self._newest = 0, (time_s if math.isnan(newest_s) else max(time_s, newest_s), came_s)
