@@ -73,9 +73,8 @@ def describe_contradictions(locator: AerialLocator, seen: Sequence[tuple[float, 
     if not (found := find_contradictions(locator, seen)):
         return ""
     first, others = found[0], f"; and {len(found) - 1} more" if len(found) > 1 else ""
-    when = f"{'at' if first.leaps else 'from'} {first.begin_s:.1f} {'and until' if first.leaps else 'to'} "
-    what = first.describe(flying_height(locator))
-    words = f"log and pictures contradict each other {when}{first.end_s:.1f} s: {what}{others}"
+    when = f"from {first.begin_s:.1f} to {first.end_s:.1f} s"
+    words = f"log and pictures contradict each other {when}: {first.describe(flying_height(locator))}{others}"
     return f"{locator.rate_warning}{words}"
 
 
